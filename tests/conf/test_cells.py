@@ -30,15 +30,15 @@ JOINED = {"fig10_focal": "fig10", "fig10_start": "fig10", "parsimony_resolutions
 # An experiment that sweeps over rows that several experiments share.
 SHARED_ROWS = {"speed_accuracy": "speed_completion", "core": "core_complete"}
 COMPARING = {
-    "table1": 24,
+    "table1": 25,
     "fig4": 7,
     "fig5": 9,
-    "stability": 21,
-    "gradients": 14,
-    "speed_accuracy": 30,
-    "fit_for": 18,
+    "stability": 22,
+    "gradients": 16,
+    "speed_accuracy": 32,
+    "fit_for": 19,
 }  # renderers
-COMPARING |= {"core": 11}
+COMPARING |= {"core": 12}
 CELLS = {"smoke": 2, "desk": None}  # at most, of an experiment
 EXPECTED = json.loads(FILE.read_text(encoding="utf-8")) if FILE.is_file() else {}
 

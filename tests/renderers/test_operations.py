@@ -22,6 +22,7 @@ LIMITS = {  # operations and waits of a rendering of 64 x 64 rays, its loss and 
     "dvr_64": (320, 3),
     "relaxed_boundary": (4200, 40),
     "neus": (470, 5),
+    "opaque": (650, 5),
     "unisurf": (440, 6),
     "volsdf": (2550, 15),
 }

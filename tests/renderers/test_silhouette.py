@@ -105,7 +105,7 @@ def test_a_correct_hit_costs_nothing_for_any_threshold_of_the_renderer():
     assert of_sphere(rough, load("silhouette", "hinge"), [True] * 2 + [False] * 3) == (5e-5, 1.0)
 
 
-@each("name", ["neus", "volsdf", "unisurf"])
+@each("name", ["neus", "opaque", "volsdf", "unisurf"])
 def test_each_spurious_hit_shrinks_the_shape_whatever_its_closest_value(name):
     """The least value of a volume renderer may lie in front of the surface, and would cost nothing at a hit."""
     radius = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)

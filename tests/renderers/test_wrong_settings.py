@@ -29,7 +29,13 @@ LEVEL = Shape(lambda p: p.norm(dim=-1) - 0.5)
 renderer, silhouette, view = partial(load, "renderer"), partial(load, "silhouette"), partial(replace, camera())
 decoder = partial(Decoder, **{"layers": 4, "width": 8, "code_length": 4, "skip": 2, "narrow": False})
 traced = partial(trace, sphere(0.5), radius=1.0, **{"lipschitz": 1.0, "least_step": 2e-4})
-VOLUMES = {"neus": "sharpness", "volsdf": "error", "unisurf": "interval", "relaxed_boundary": "band"}
+VOLUMES = {
+    "neus": "sharpness",
+    "opaque": "sharpness",
+    "volsdf": "error",
+    "unisurf": "interval",
+    "relaxed_boundary": "band",
+}
 
 
 def unchecked(kind: type, **values) -> None:
@@ -44,6 +50,8 @@ WRONG: list[tuple[str, Callable, dict]] = [  # words of the error, what is built
     ("occupied_at must be one of random, depth", partial(silhouette, "occupancy"), {"occupied_at": "hull"}),
     *((f"{key} must be positive, not 0", partial(renderer, name), {key: 0.0})
       for name, own in VOLUMES.items() for key in (own, "sphere_radius")),
+    *(("anisotropy must lie between 0", partial(renderer, "opaque"), {"anisotropy": wrong})
+      for wrong in (-0.1, 1.1, NAN)),
     ("relaxation needs step_back=true", partial(renderer, "dist"), {"relaxation": 0.3}),
     ("relaxation must lie between 0", partial(renderer, "dist"), {"relaxation": 1.3, "step_back": True}),
     *(("doublings must be rising iterations from 0", partial(renderer, "dvr"), {"doublings": wrong})

@@ -403,7 +403,7 @@ def test_an_iteration_keeps_its_position_in_a_copy():
     assert (iteration, schedule_position(iteration), schedule_position(7)) == (7, 3, 7)
 
 
-@each("name", ["neus", "volsdf", "unisurf", "dvr"])
+@each("name", ["neus", "opaque", "volsdf", "unisurf", "dvr"])
 def test_schedules_follow_the_position_and_a_memory_the_index(name):
     renderer = load("renderer", name)
     assert at_iteration(renderer, Iteration(500, 0)) == at_iteration(renderer, 0) != at_iteration(renderer, 90)

@@ -19,11 +19,13 @@ from renderers.rendering import Blurred, Status, Volume, at_iteration
 from renderers.tracing.bracket import equally_spaced
 from tests.renderers.analytic_cases import CASES, Case, sheet, vector
 
-NEUS, VOLSDF, UNISURF = (load("renderer", name) for name in ("neus", "volsdf", "unisurf"))
+NEUS, VOLSDF, UNISURF, OPAQUE = (load("renderer", name) for name in ("neus", "volsdf", "unisurf", "opaque"))
 BAND = load("renderer", "relaxed_boundary")
-VOLUMES = pytest.mark.parametrize("renderer", [NEUS, VOLSDF, UNISURF], ids=lambda renderer: type(renderer).__name__)
+VOLUMES = pytest.mark.parametrize(
+    "renderer", [NEUS, VOLSDF, UNISURF, OPAQUE], ids=lambda renderer: type(renderer).__name__
+)
 BLURRED = pytest.mark.parametrize(
-    "renderer", [NEUS, VOLSDF, UNISURF, BAND], ids=lambda renderer: type(renderer).__name__
+    "renderer", [NEUS, VOLSDF, UNISURF, OPAQUE, BAND], ids=lambda renderer: type(renderer).__name__
 )
 PLANES = [case for case in CASES if case.name.startswith("plane")]
 
@@ -57,6 +59,43 @@ def test_neus_is_unbiased_and_volsdf_is_not(case):
     assert weight.distance[weight.weight.argmax()].item() == pytest.approx(case.distance, abs=2.5e-4)
     off = error(replace(VOLSDF, fine_samples=512), case, 0.01)  # positive behind the surface; in front of it at a slant
     assert off == pytest.approx({1.0: 0.36, 0.8: 0.06, 0.28: -4.06}[case.cosine], abs=0.02)
+
+
+@pytest.mark.parametrize("anisotropy", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("case", PLANES, ids=lambda case: case.name)
+def test_delta_normals_of_an_opaque_solid_are_unbiased_and_uniform_ones_are_not(case, anisotropy):
+    """Between both, the mean of a plane's weights lies behind a frontal plane and in front of an oblique one."""
+    renderer = replace(OPAQUE, anisotropy=anisotropy)
+    off = {0.0: (0.70, 0.57, -1.71), 0.5: (0.27, 0.24, -1.02), 1.0: (0.0, 0.0, 0.0)}[anisotropy]
+    expected = dict(zip((1.0, 0.8, 0.28), off, strict=True))[case.cosine]
+    assert error(replace(renderer, samples=4000, rounds=0), case, 0.01) == pytest.approx(expected, abs=0.01)
+    assert error(renderer, case, 0.01) == pytest.approx(expected, abs=0.02)  # its 128 samples are enough
+
+
+@pytest.mark.parametrize("anisotropy", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("slope", [-0.9, -0.2, 0.0, 0.4], ids=str)
+def test_the_attenuation_of_an_interval_is_its_integral(anisotropy, slope):
+    """Of values that are linear along the ray, against 20,001 samples of the attenuation, from 9 to -5 deviations."""
+    renderer = replace(OPAQUE, anisotropy=anisotropy, sharpness=50.0)
+    start = torch.linspace(0.18, -0.1, 9, dtype=torch.float64)
+    ends = torch.stack([start, start + 0.03 * slope], dim=1)
+    fraction = torch.linspace(0, 1, 20_001, dtype=torch.float64)
+    values = 50 * (ends[:, :1] + fraction * (ends[:, 1:] - ends[:, :1]))
+    normal = torch.distributions.Normal(vector(0), vector(1))
+    rate = 50 * normal.log_prob(values).exp() / normal.cdf(values)
+    truth = -(anisotropy * abs(slope) + (1 - anisotropy) / 2) * torch.trapezoid(rate, 0.03 * fraction, dim=1)
+    actual = renderer._log_transmittance(ends, vector((0.0, 0.03)).expand(9, 2))
+    torch.testing.assert_close(actual.squeeze(1), truth, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_an_opaque_solid_has_finite_weights_and_gradients_at_every_value(dtype):
+    values = torch.tensor([[1.0, 0.5, 0.5, 1e-9, 0.0, -1e-9, -0.4, -0.4, -1.0, 1.0]], dtype=dtype, requires_grad=True)
+    distances = torch.linspace(0, 2, 10, dtype=dtype)[None]
+    passing = replace(OPAQUE, sharpness=1e4)._log_transmittance(values, distances)
+    assert passing.isfinite().all() and (passing <= 0).all()
+    (gradient,) = torch.autograd.grad(weights(passing).square().sum() + passing[:, :5].sum(), values)
+    assert gradient.isfinite().all() and gradient.any()
 
 
 @pytest.mark.parametrize(
@@ -147,7 +186,8 @@ def test_the_band_carries_the_gradient_of_the_silhouette_with_the_bias_of_its_wi
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("renderer", "ratio", "margin"), [
-    (NEUS, 1.0, 0.01), (VOLSDF, 1.05, 2.9), (UNISURF, 1.08, 2.97),
+    (NEUS, 1.0, 0.01), (VOLSDF, 1.05, 2.9), (UNISURF, 1.08, 2.97), (OPAQUE, 1.03, 1.39),
+    (replace(OPAQUE, anisotropy=0.0), 1.04, 1.70), (replace(OPAQUE, anisotropy=1.0), 1.03, 0.56),
 ], ids=lambda renderer: type(renderer).__name__)  # fmt: skip
 def test_opacity_carries_the_gradient_of_a_silhouette_that_density_outside_makes_larger(renderer, ratio, margin):
     """The margin is in units of the blur: except for NeuS, density outside absorbs light along a close ray."""
@@ -172,7 +212,7 @@ def test_the_weight_of_a_surface_that_enters_the_view_replaces_that_of_the_wall(
 
 
 @pytest.mark.parametrize("iteration", [0, None])
-@pytest.mark.parametrize("renderer", [NEUS, VOLSDF], ids=lambda renderer: type(renderer).__name__)
+@pytest.mark.parametrize("renderer", [NEUS, VOLSDF, OPAQUE], ids=lambda renderer: type(renderer).__name__)
 def test_distances_have_the_gradient_of_the_surface_at_every_sharpness(renderer, iteration):
     """Away from the outline the distance to a sphere falls by 1 / cosine as its radius grows."""
     now = renderer if iteration is None else at_iteration(renderer, iteration)
