@@ -55,7 +55,7 @@ def test_user_renderers_have_rows_in_an_experiment_that_compares_renderers(tmp_p
     plan = swept("+experiment=stability", "stress=thin_plate", f"packages=[{package}]", folder=tmp_path / "conf")
     renderers = rows(plan)
     assert renderers[0] == "mine_first" and renderers[-2:] == ["mine", "mine_on_dist"]  # the last two have no _rows_
-    assert len(renderers) == len(plan.cells) == 1 + 21 + 2 + 1
+    assert len(renderers) == len(plan.cells) == 1 + 22 + 2 + 1
     assert renderers[-3] == "mine_on_keinert"  # from the user's table
     assert "custom" not in renderers and "mine_nowhere" not in renderers
     cells = {cell.renderer: cell for cell in plan.cells}
