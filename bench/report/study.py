@@ -8,7 +8,7 @@ stress tests.
 # ruff: noqa: F401 - these imports are re-exported
 from bench.pictures import figure_style, style
 from bench.records import format
-from bench.report import breakdowns, compare, conditions, gallery, medians
+from bench.report import breakdowns, compare, condition_curves, conditions, gallery, medians
 from bench.report.compare import published
 from bench.report.data import curves, records, statistics
 from bench.report.data.runs import NoFolder, Runs, Selection, merge_runs

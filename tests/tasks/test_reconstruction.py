@@ -264,3 +264,27 @@ def test_the_block_of_pixels_divides_the_rays(scene, tmp_path):
     short = replace(SETTINGS.optimiser, budget=2e4)
     sampled = replace(SETTINGS, pixel_block=0, optimiser=short).problem("network_2x16", subject, run)
     assert sampled.rays_per_iteration in (4, 12, 48) and sampled.counts.cost == 0
+
+
+def test_learnt_cameras_move_and_kept_ones_stay(tmp_path, scene):
+    settings = {"camera_noise": 6.0}
+    (tmp_path / "learnt").mkdir()
+    kept = executed(run_in(tmp_path, scene), **settings)
+    learnt = executed(run_in(tmp_path / "learnt", scene), cameras="refine", **settings)
+    assert kept.metrics["camera_error_deg"] == pytest.approx(6, rel=1e-3)
+    assert learnt.metrics_start["camera_error_deg"] == pytest.approx(6, rel=1e-3)
+    assert abs(learnt.metrics["camera_error_deg"] - 6) > 0.01
+    assert "camera_error_deg" in learnt.definitions
+
+
+def test_cameras_are_not_learnt_without_a_gradient_towards_rays(tmp_path, scene):
+    run = run_in(tmp_path, scene)
+    blind = replace(run, inputs=replace(run.inputs, renderer=_WithoutRayGradient()))
+    with pytest.raises(Unsupported, match="given"):
+        executed(blind, cameras="refine")
+
+
+class _WithoutRayGradient:
+    """A renderer that has no gradient towards rays."""
+
+    capabilities = replace(load("renderer", "idr").capabilities, ray_gradient=False)

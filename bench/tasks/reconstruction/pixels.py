@@ -25,6 +25,7 @@ class Pixels:
         distance: given distances along the rays, NaN for pixels without one; None if no pixel has one.
         guide: distances that a silhouette loss may use, in the same format.
         normals: given normals, 0 for pixels without one; None if no pixel has one.
+        photograph: index of each pixel's photograph; None if they share a camera.
     """
 
     rays: Rays
@@ -34,6 +35,7 @@ class Pixels:
     distance: Float[Tensor, " n"] | None
     guide: Float[Tensor, " n"] | None
     normals: Float[Tensor, "n 3"] | None
+    photograph: Int[Tensor, " n"] | None = None
 
     def __getitem__(self, index: Int[Tensor, " m"]) -> "Pixels":
         tensors = {column.name: getattr(self, column.name) for column in fields(self)}
@@ -73,6 +75,7 @@ class Stack:
             torch.cat([distance.flatten() for distance in distances]).to(device) if distances else None,
             torch.cat([distance.flatten() for distance in guide]).to(device) if guide else None,
             torch.cat(normals).to(device) if normals else None,
+            torch.cat([torch.full((ray.shape[0],), index) for index, ray in enumerate(rays)]).to(device),
         )
         in_sphere = sphere_span(all_rays)[2]
         inner = torch.cat([_upper_left(shot) for shot in shots])

@@ -1,7 +1,7 @@
 """The inverse problem of learning a shape with colours from random pixels of photographs."""
 
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from bench.evaluate.state import State
 from bench.pictures.filmstrip import Shown
 from bench.solve.latent_code import Terms
 from bench.solve.pixel_draw import generator_of
+from bench.tasks.reconstruction.cameras import CameraMotions
 from bench.tasks.reconstruction.judge import field_scores, judge, surface_scores
 from bench.tasks.reconstruction.losses import Losses
 from bench.tasks.reconstruction.pictures import draw_reconstruction
@@ -43,11 +44,12 @@ class ReconstructionProblem:
     rays_per_iteration: int
     iterations: int
     seed: int
+    motions: CameraMotions
     counts: Counts = field(default_factory=Counts)
 
     @property
     def parameters(self) -> list[Tensor]:
-        return list(self.model.parameters())
+        return [*self.model.parameters(), *([self.motions.numbers] if self.motions.learnt else [])]
 
     @property
     def tracked(self) -> tuple[str, ...]:
@@ -77,7 +79,8 @@ class ReconstructionProblem:
         return self.subject.held_out[0].camera
 
     def evaluate(self, state: State) -> Evaluation:
-        return judge(state, self.subject)
+        evaluation = judge(state, self.subject)
+        return replace(evaluation, metrics=evaluation.metrics | self.motions.errors())
 
     def checkpoint(self, state: State) -> dict[str, float]:
         scores = surface_scores(state.mesh, self.subject, state.inputs)
@@ -91,7 +94,7 @@ class ReconstructionProblem:
         """The terms and their sum, over new random pixels in each iteration."""
         patches = self.losses.colour_gradient > 0
         seed = generator_of(self.seed, iteration).initial_seed()
-        pixels = self.stack.draw(self.rays_per_iteration, patches=patches, seed=seed)
+        pixels = self.motions.apply(self.stack.draw(self.rays_per_iteration, patches=patches, seed=seed))
         shape = self.model.field
         return self.losses(at_iteration(self.renderer, iteration), shape, Meter(shape, self.counts), pixels)
 
@@ -100,7 +103,8 @@ class ReconstructionProblem:
 
         The loss is not used, because it compares hits only: it falls if the surface disappears.
         """
-        return float(self.colour_errors(self.stack.draw(OBJECTIVE_PIXELS, patches=False, seed=self.seed)).mean())
+        pixels = self.stack.draw(OBJECTIVE_PIXELS, patches=False, seed=self.seed)
+        return float(self.colour_errors(self.motions.apply(pixels)).mean())
 
     def colour_errors(self, pixels: Pixels) -> Float[Tensor, " n"]:
         """The mean difference of the three colours of each pixel, black outside of the shape and of masks."""

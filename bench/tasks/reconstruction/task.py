@@ -10,6 +10,7 @@ from bench.evaluate.state import State
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import OptimiserSettings, with_affordable_rays
 from bench.solve.solve import check_field_gradient, solve_and_draw
+from bench.tasks.reconstruction import cameras
 from bench.tasks.reconstruction.choice import DEFINITIONS, Appearance, AutoField
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, judge
 from bench.tasks.reconstruction.losses import Losses
@@ -26,7 +27,7 @@ from bench.tasks.reconstruction.subject import (
 )
 from renderers.checks import check_at_least, check_choice
 from renderers.field import Field
-from renderers.rendering import check_kind
+from renderers.rendering import Unsupported, check_kind
 
 UNMASKED_WARNING = "without masks nothing says where the object ends: expect the shape to keep what is behind it"
 COUNT_DEFINITIONS = {
@@ -50,6 +51,9 @@ class Reconstruction(PhotographTask):
         optimiser: iterations and learning rates.
         pixel_block: its square divides `rays`; 0: the smallest divisor that the budget affords, see
             `bench.solve.optimise.with_affordable_rays`.
+        cameras: "given", or "refine": a rigid motion of each camera but the first is learnt with the shape.
+        camera_noise: degrees by which each input camera but the first is wrong, about a random axis through the origin.
+            None: 0, and the errors of cameras are not measured.
     """
 
     guide: str
@@ -59,6 +63,8 @@ class Reconstruction(PhotographTask):
     losses: Losses
     optimiser: OptimiserSettings
     pixel_block: int = 1
+    cameras: str = cameras.GIVEN
+    camera_noise: float | None = None
 
     takes_field: ClassVar[bool] = True
 
@@ -67,18 +73,27 @@ class Reconstruction(PhotographTask):
         check_choice("task.guide", self.guide, GUIDES)
         check_at_least("task.pixel_block", self.pixel_block, 0, "2 draws a quarter of task.rays")
         check_at_least("task.rays", self.rays, 4, "1024 work")
+        check_choice("task.cameras", self.cameras, cameras.CHOICES)
+        check_at_least("task.camera_noise", self.camera_noise or 0, 0, "0 keeps the cameras")
         if self.losses.colour_gradient and self.rays % 4:
             raise ValueError(f"task.rays must be a multiple of 4 for patches of 2 x 2 pixels, not {self.rays}: 1024")
 
     def execute(self, run: RunContext) -> None:
         name, inputs = run.inputs.field.name, run.inputs
         check_field_gradient(inputs.renderer)
+        if self.cameras == cameras.REFINE and not inputs.renderer.capabilities.ray_gradient:
+            raise Unsupported(f"{type(inputs.renderer).__name__} has no gradient towards rays: set task.cameras=given")
         with torch.random.fork_rng():
             candidates = self.auto.candidates if name == AUTO else (name,)
             models = {candidate: self.appearance.make(candidate) for candidate in candidates}
         for model in models.values():  # before the slow reading of photographs
             check_kind(inputs.renderer, model.field)
-        definitions = COLOURED_DEFINITIONS | COUNT_DEFINITIONS | (DEFINITIONS if name == AUTO else {})
+        definitions = (
+            COLOURED_DEFINITIONS
+            | ({} if self.camera_noise is None else cameras.DEFINITIONS)
+            | COUNT_DEFINITIONS
+            | (DEFINITIONS if name == AUTO else {})
+        )
         run.record.definitions = dict(definitions)
         subject = self.subject(inputs)
         warnings = [UNMASKED_WARNING] if subject.input_shots[0].mask is None else []
@@ -105,13 +120,16 @@ class Reconstruction(PhotographTask):
     def problem(self, name: str, subject: Subject, run: RunContext) -> ReconstructionProblem:
         inputs = run.inputs
         model = self.appearance.make(name).to(inputs.device)
+        true = None if self.camera_noise is None else [shot.camera for shot in subject.input_shots]
+        shots = cameras.disturbed(subject.input_shots, self.camera_noise or 0, inputs.seed)
         guide = {GIVEN: given_distances, HULL: hull_distances}.get(self.guide)
-        stack = Stack.build(subject.input_shots, guide and guide(subject.input_shots), inputs.device)
+        stack = Stack.build(shots, guide and guide(shots), inputs.device)
         iterations = self.optimiser.iterations
 
         def problem(task: Reconstruction) -> ReconstructionProblem:
             rays = max(self.rays // task.pixel_block**2, 4)
-            args = self.losses, inputs.renderer, rays, iterations, inputs.seed
+            motions = cameras.CameraMotions(shots, true, self.cameras == cameras.REFINE, inputs.device)
+            args = self.losses, inputs.renderer, rays, iterations, inputs.seed, motions
             return ReconstructionProblem(subject, stack, model, *args)
 
         return with_affordable_rays(self, problem)

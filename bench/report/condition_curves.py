@@ -1,0 +1,141 @@
+"""A page of one condition that takes several values: medians of some metrics for each row, and ratios to one value."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bench.records import format
+from bench.report.data import statistics
+from bench.report.data.runs import Runs
+from bench.report.write import chart
+from bench.report.write.result import Result
+from bench.report.write.table import Column, ends, text
+
+SHAPE = ["family", "solid", "seed"]
+UNCHANGED = " (not significant)"
+VERDICTS = {statistics.Verdict.DIFFERS: "", statistics.Verdict.NOT_DECIDABLE: " (undecided)"}
+NOTE = (
+    "Values are medians over shapes, with intervals of the sign test. A ratio compares the same shapes. The verdict's "
+    "significance is by the sign test with Holm's correction over all its ratios."
+)
+Line = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A metric of a page: its column of a run, its heading, and a factor."""
+
+    key: str
+    heading: str
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class ConditionCurves:
+    """A page over the values of a condition.
+
+    Args:
+        condition: key of the configuration.
+        heading: of the condition.
+        first: the value that the verdict and the ratios compare with.
+        compared: the value of the verdict.
+        measures: the metrics. Ratios and the verdict are of the first. A run without the metric counts as infinite;
+            one that ended without progress counts with its result.
+        title, question, verdict: text; `verdict` begins the sentence with the ratios.
+        notes: of the runs.
+        absent: the value of the condition in runs without the key.
+    """
+
+    condition: str
+    heading: str
+    first: float
+    compared: float
+    measures: tuple[Measure, ...]
+    title: str
+    question: str
+    verdict: str
+    notes: Callable[[Runs], list[str]]
+    absent: float = 0.0
+
+    def __call__(self, runs: Runs) -> Result:
+        """A line per row and value of the condition, over all shapes."""
+        runs = runs.executed
+        values = runs.number(f"config.{self.condition}").fillna(self.absent)
+        metrics = {each.key: each.factor * runs.number(each.key).fillna(np.inf) for each in self.measures}
+        frame = runs.frame[[*SHAPE, "row", "preset"]].assign(
+            value=values, cost=runs.number("evaluations_cost"), **metrics
+        )
+        lines = self._lines(frame)
+        return Result(
+            runs,
+            self.title,
+            f"{self.measures[0].heading}, over {self.heading.lower()}.",
+            question=self.question,
+            verdict=self._verdict(lines),
+            interval="95 % intervals over shapes (of the sign test)",
+            remarks=[*self.notes(runs), NOTE],
+            columns=self._columns(),
+            lines=lines,
+            figure=chart.draw([self._panel(lines, each) for each in self.measures], 3.4, legend=2),
+        )
+
+    def _columns(self) -> tuple[Column, ...]:
+        first = self.measures[0]
+        return (
+            *(text("name", "Method"), Column("value", self.heading), Column("shapes", "Shapes")),
+            *(Column(first.key, first.heading), *ends(first.key, lambda line: line["estimates"][first.key])),
+            *(Column("ratio", f"Ratio to {self.first:g}"), *ends("ratio", lambda line: line["gain"])),
+            *(Column(each.key, each.heading) for each in self.measures[1:]),
+            Column("cost", "Field evaluations"),
+        )
+
+    def _lines(self, frame: pd.DataFrame) -> list[Line]:
+        lines = []
+        for (name, preset), row in frame.groupby(["row", "preset"], sort=False):
+            groups = {value: group.set_index(SHAPE).sort_index() for value, group in row.groupby("value")}
+            for value, group in groups.items():
+                estimates = {each.key: _median(group[each.key]) for each in self.measures}
+                first, key = groups.get(self.first), self.measures[0].key
+                paired = value != self.first and first is not None and first.index.equals(group.index)
+                gain = statistics.ratio(_shapes(group[key]), _shapes(first[key])) if paired else None
+                lines.append(
+                    {
+                        **{"name": name, "preset": preset, "value": value, "shapes": len(group)},
+                        **{key: estimate.value for key, estimate in estimates.items()},
+                        **{"estimates": estimates, "ratio": gain and gain.value, "gain": gain},
+                        "cost": format.number(group.cost.median()),
+                    }
+                )
+        return lines
+
+    def _verdict(self, lines: list[Line]) -> str:
+        """The ratio of each row at the compared value, and whether it is significant."""
+        compared = [line for line in lines if line["value"] == self.compared and line["gain"] is not None]
+        verdicts = statistics.ratio_verdicts([line["gain"] for line in compared])
+        parts = [
+            f"{line['name']} *{format.number(line['ratio'])}*{VERDICTS.get(verdict, UNCHANGED)}"
+            for line, verdict in zip(compared, verdicts, strict=True)
+        ]
+        return f"{self.verdict}: {'; '.join(parts)}." if parts else ""
+
+    def _panel(self, lines: list[Line], measure: Measure) -> chart.Panel:
+        rows: dict[tuple[str, str], list[Line]] = {}
+        for line in lines:
+            rows.setdefault((line["name"], line["preset"]), []).append(line)
+        curves = [
+            chart.curve(*row, [line["value"] for line in points], [line["estimates"][measure.key] for line in points])
+            for row, points in rows.items()
+        ]
+        return chart.panel_data("", self.heading.lower(), measure.heading, curves)
+
+
+def _shapes(values: pd.Series) -> list[np.ndarray]:
+    """A group per shape, for `statistics`."""
+    return [group.to_numpy() for _, group in values.groupby(level=SHAPE[:2])]
+
+
+def _median(values: pd.Series) -> statistics.Interval:
+    return statistics.typical(_shapes(values))

@@ -1,0 +1,37 @@
+"""Reconstruction from photographs with wrong cameras, which are kept or learnt with the shape."""
+
+from bench.report.study import Runs, Selection, condition_curves
+
+PLACE = 46
+NOISE = "task.camera_noise"
+READS = (Selection("camera_noise", (NOISE,)),)
+NOTES = [
+    "Each input photograph's camera but the first is wrong by this angle, about a random axis through the object's "
+    "centre. Held-out photographs have true cameras.",
+    "Rows with learnt cameras optimise a rigid motion of each camera but the first, with the shape and its colours.",
+    "Chamfer-L1 is over what photographs see, in the world of the first photograph's camera.",
+]
+
+
+def notes(runs: Runs) -> list[str]:
+    """The notes."""
+    return NOTES
+
+
+PAGES = {
+    "camera_noise": condition_curves.ConditionCurves(
+        condition=NOISE,
+        heading="Camera error at the start (degrees)",
+        first=0,
+        compared=3,
+        measures=(
+            condition_curves.Measure("seen_chamfer_l1", "Chamfer-L1 × 1000", 1e3),
+            condition_curves.Measure("psnr", "PSNR of held-out photographs (dB)"),
+            condition_curves.Measure("camera_error_deg", "Camera error (degrees)"),
+        ),
+        title="Reconstruction with wrong cameras.",
+        question="Does learning cameras with the shape undo their errors?",
+        verdict="Chamfer-L1 with cameras that are 3 degrees wrong over that with true ones",
+        notes=notes,
+    )
+}
