@@ -17,6 +17,7 @@ from renderers.rendering import RayObservation, Renderer, Volume
 from renderers.silhouette import SilhouetteLoss
 
 EIKONAL_POINTS = 512  # random points of the cube
+BLENDED, SAMPLES = COLOURS = ("blended", "samples")
 NEIGHBOUR_CUBE_SIDE = 2e-3  # scene units: a neighbour is drawn in this cube; DVR's code: 1e-3 of a unit cube
 
 
@@ -37,6 +38,9 @@ class Losses:
         normals: weight of 1 minus the cosine between normals and given ones, the mean over hits (DIST, B.3).
         eikonal: weight of the squared difference of a distance's slope from 1, two means: at hits on the foreground and
             in the cube (IDR, Sec. 3.4). A level set has none.
+        colour_of: what a volume renderer compares: "blended", the colour summed along a ray, or "samples", each
+            sample's colour, where the errors are weighted and not the colours. The light that passes all samples is
+            compared as black ("Radiance Surfaces", arXiv 2501.18627: the loss of each sample as a surface).
     """
 
     colour: float
@@ -48,9 +52,13 @@ class Losses:
     smoothness: float
     normals: float
     eikonal: float
+    colour_of: str = BLENDED
 
     def __post_init__(self) -> None:
         check_choice("task.losses.depth_loss", self.depth_loss, DEPTH_LOSSES)
+        check_choice("task.losses.colour_of", self.colour_of, COLOURS)
+        if self.colour_of == SAMPLES and self.colour_gradient:
+            raise ValueError("task.losses.colour_gradient compares blended colours: 0 suits colour_of=samples")
         for name in ("colour", "colour_gradient", "depth", "silhouette_weight", "smoothness", "normals", "eikonal"):
             check_at_least(f"task.losses.{name}", getattr(self, name), 0, "0 switches the term off")
 
@@ -69,11 +77,16 @@ class Losses:
         gradients = gradients_at(metered, points)
         normals = torch.nn.functional.normalize(gradients, dim=-1)
         terms: Terms = {}
-        if self.colour or self.colour_gradient:
+        if (self.colour or self.colour_gradient) and rendering.volume is not None and pixels.mask is None:
+            raise BadInput(f"{type(renderer).__name__} needs masks: without them it would paint what is behind too")
+        if self.colour and self.colour_of == SAMPLES:
+            if rendering.volume is None:
+                raise BadInput(f"{type(renderer).__name__} has no samples: take task.losses.colour_of=blended")
+            errors = _sample_errors(shape, metered, pixels, rendering.volume)[pixels.mask]
+            terms["colour"] = self.colour * errors.sum() / rays
+        elif self.colour or self.colour_gradient:
             if rendering.volume is None:
                 compared, colours = inside, shape.colours(points, gradients, pixels.rays.directions[inside])
-            elif pixels.mask is None:
-                raise BadInput(f"{type(renderer).__name__} needs masks: without them it would paint what is behind too")
             else:
                 compared = pixels.mask
                 colours = _volume_colours(shape, metered, pixels.rays, rendering.volume)[compared]
@@ -109,11 +122,22 @@ class Losses:
 
 def _volume_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "n 3"]:
     """The colours of rays through a volume in front of black: the weighted sums of the samples' colours."""
+    return volume.weighted_sum(_sample_colours(shape, field, rays, volume), len(rays.origins))
+
+
+def _sample_errors(shape: Coloured, field: Field, pixels: Pixels, volume: Volume) -> Float[Tensor, " n"]:
+    """The l1 error of each ray: of the samples' colours by their weights, and of black by the weight that is left."""
+    count = len(pixels.colours)
+    errors = (_sample_colours(shape, field, pixels.rays, volume) - pixels.colours[volume.ray]).abs().sum(dim=-1)
+    passing = 1 - volume.weighted_sum(torch.ones_like(errors), count)
+    return volume.weighted_sum(errors, count) + passing * pixels.colours.sum(dim=-1)
+
+
+def _sample_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "samples 3"]:
+    """The colours of all samples with a weight, seen along their rays."""
     sample_rays = rays[volume.ray]
     points = sample_rays.at(volume.distance)
-    return volume.weighted_sum(
-        shape.colours(points, gradients_at(field, points), sample_rays.directions), len(rays.origins)
-    )
+    return shape.colours(points, gradients_at(field, points), sample_rays.directions)
 
 
 def _neighbour_error(difference: Float[Tensor, "n 3"], inside: Bool[Tensor, " n"]) -> Float[Tensor, ""]:

@@ -13,6 +13,7 @@ from bench.tasks.reconstruction.losses import EIKONAL_POINTS, NEIGHBOUR_CUBE_SID
 from bench.tasks.reconstruction.pixels import Pixels
 from datasets.shot import Shot
 from renderers.camera import Camera, Rays
+from renderers.checks import BadInput
 from renderers.field import Coloured, Kind, Meter
 from renderers.silhouette import Own
 from tests.looped import each
@@ -122,6 +123,53 @@ def test_the_colour_term_is_the_sum_over_hits_on_the_foreground_over_all_rays(ma
     assert set(terms) == {"total", "colour"}
     assert terms["colour"].item() == pytest.approx(3.0 * expected / 64, rel=1e-9)
     assert torch.equal(terms["total"], terms["colour"])
+
+
+@each("target", [0.0, 1.0, None])
+@each("name", ["neus", "opaque"])
+def test_the_samples_of_a_volume_have_a_larger_error_than_their_blended_colour(name, target):
+    """Equal if all colours lie on one side of the target: then the error is linear in the colour."""
+    renderer = load("renderer", name).with_blur(0.1)
+    colours = PIXELS.colours if target is None else torch.full_like(PIXELS.colours, target)
+    pixels = replace(PIXELS, mask=LEFT_HALF, colours=colours)
+    blended, samples = (
+        losses(colour=2.0, colour_of=kind)(renderer, BALL, Meter(BALL), pixels)["colour"].item()
+        for kind in ("blended", "samples")
+    )
+    if target is None:
+        assert samples > 1.01 * blended > 0
+    else:
+        assert samples == pytest.approx(blended, rel=1e-9) and blended > 0
+
+
+def test_the_error_of_samples_is_that_of_each_sample_by_its_weight():
+    renderer = load("renderer", "neus").with_blur(0.05)
+    pixels = replace(PIXELS, mask=LEFT_HALF)
+    terms = losses(colour=2.0, colour_of="samples")(renderer, BALL, Meter(BALL), pixels)
+    assert set(terms) == {"total", "colour"}
+    volume = renderer.render(BALL, pixels.rays).volume
+    expected, passing = 0.0, torch.ones(64, dtype=torch.float64)
+    for ray, distance, weight in zip(volume.ray, volume.distance, volume.weight, strict=True):
+        direction = pixels.rays.directions[ray]
+        point = pixels.rays.origins[ray] + distance * direction
+        inputs = torch.cat([point, torch.nn.functional.normalize(point - BALL.centre, dim=0), direction, vector((1,))])
+        error = (torch.sigmoid(BALL.paint @ inputs) - pixels.colours[ray]).abs().sum()
+        passing[ray] -= weight
+        expected += float(weight * error) * bool(LEFT_HALF[ray])
+    expected += float((passing * pixels.colours.sum(-1))[LEFT_HALF].sum())
+    assert terms["colour"].item() == pytest.approx(2.0 * expected / 64, rel=1e-9)
+
+
+def test_colours_of_samples_need_a_volume_with_masks_and_no_differences():
+    settings = losses(colour=1.0, colour_of="samples")
+    with pytest.raises(BadInput, match=r"IDR has no samples: take task\.losses\.colour_of=blended"):
+        terms_of(settings, BALL, replace(PIXELS, mask=LEFT_HALF))
+    with pytest.raises(BadInput, match="NeuS needs masks"):
+        settings(load("renderer", "neus"), BALL, Meter(BALL), PIXELS)
+    with pytest.raises(ValueError, match=r"task\.losses\.colour_gradient compares blended colours"):
+        losses(colour=1.0, colour_gradient=1.0, colour_of="samples")
+    with pytest.raises(ValueError, match=r"task\.losses\.colour_of must be one of blended, samples"):
+        losses(colour=1.0, colour_of="mean")
 
 
 @each("weight", [0.0, 2.0])
