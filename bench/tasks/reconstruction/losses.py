@@ -11,12 +11,12 @@ from bench.solve.observed_view import DEPTH_LOSSES, depth_error, gradients_at, n
 from bench.tasks.reconstruction.pixels import Pixels
 from renderers.boundary import render_checked
 from renderers.camera import Rays
-from renderers.checks import BadInput, check_at_least, check_choice
+from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.field import Coloured, Field, Kind, Meter
 from renderers.rendering import RayObservation, Renderer, Volume
 from renderers.silhouette import SilhouetteLoss
 
-EIKONAL_POINTS = 512  # random points of the cube
+CUBE_POINTS = 512  # random points of the cube, for `eikonal` and `heat`
 BLENDED, SAMPLES = COLOURS = ("blended", "samples")
 NEIGHBOUR_CUBE_SIDE = 2e-3  # scene units: a neighbour is drawn in this cube; DVR's code: 1e-3 of a unit cube
 
@@ -41,6 +41,9 @@ class Losses:
         colour_of: what a volume renderer compares: "blended", the colour summed along a ray, or "samples", each
             sample's colour, where the errors are weighted and not the colours. The light that passes all samples is
             compared as black ("Radiance Surfaces", arXiv 2501.18627: the loss of each sample as a surface).
+        heat: weight of the heat loss of a distance u, the mean in the cube of exp(-2 rate |u|) (|grad u|^2 + 1) / 2
+            (HotSpot, Wang et al., CVPR 2025, arXiv 2411.14628). A level set has none.
+        heat_rate: absorption of the heat, per scene unit: the loss acts within about its inverse of the surface.
     """
 
     colour: float
@@ -53,13 +56,26 @@ class Losses:
     normals: float
     eikonal: float
     colour_of: str = BLENDED
+    heat: float = 0.0
+    heat_rate: float = 10.0
 
     def __post_init__(self) -> None:
         check_choice("task.losses.depth_loss", self.depth_loss, DEPTH_LOSSES)
         check_choice("task.losses.colour_of", self.colour_of, COLOURS)
         if self.colour_of == SAMPLES and self.colour_gradient:
             raise ValueError("task.losses.colour_gradient compares blended colours: 0 suits colour_of=samples")
-        for name in ("colour", "colour_gradient", "depth", "silhouette_weight", "smoothness", "normals", "eikonal"):
+        check_positive("task.losses.heat_rate", self.heat_rate, "10 acts within 0.1 scene units of the surface")
+        weights = (
+            "colour",
+            "colour_gradient",
+            "depth",
+            "silhouette_weight",
+            "smoothness",
+            "normals",
+            "eikonal",
+            "heat",
+        )
+        for name in weights:
             check_at_least(f"task.losses.{name}", getattr(self, name), 0, "0 switches the term off")
 
     def __call__(self, renderer: Renderer, shape: Coloured, metered: Meter, pixels: Pixels) -> Terms:
@@ -111,10 +127,15 @@ class Losses:
             terms["smoothness"] = self.smoothness * torch.linalg.vector_norm(normals - neighbours, dim=-1).sum() / rays
         if self.normals and pixels.normals is not None:
             terms["normals"] = self.normals * normal_error(normals, pixels.normals[inside])
-        if self.eikonal and shape.kind is not Kind.LEVEL:
-            random_points = 2 * torch.rand(EIKONAL_POINTS, 3, device=points.device) - 1
+        if (self.eikonal or self.heat) and shape.kind is not Kind.LEVEL:
+            random_points = 2 * torch.rand(CUBE_POINTS, 3, device=points.device) - 1
             slopes = [torch.linalg.vector_norm(g, dim=-1) for g in (gradients, gradients_at(metered, random_points))]
-            terms["eikonal"] = self.eikonal * sum((slope - 1).square().sum() / max(len(slope), 1) for slope in slopes)
+            if self.eikonal:
+                errors = sum((slope - 1).square().sum() / max(len(slope), 1) for slope in slopes)
+                terms["eikonal"] = self.eikonal * errors
+            if self.heat:
+                remaining = (-2 * self.heat_rate * metered(random_points).abs()).exp()
+                terms["heat"] = self.heat * (remaining * (slopes[1].square() + 1) / 2).mean()
         if not terms:
             raise BadInput("no term of the loss is left: give a weight of task.losses that the photographs can serve")
         return {"total": total(terms), **terms}

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bench.config import load
 from bench.solve.latent_code import Terms
-from bench.tasks.reconstruction.losses import EIKONAL_POINTS, NEIGHBOUR_CUBE_SIDE, Losses
+from bench.tasks.reconstruction.losses import CUBE_POINTS, NEIGHBOUR_CUBE_SIDE, Losses
 from bench.tasks.reconstruction.pixels import Pixels
 from datasets.shot import Shot
 from renderers.camera import Camera, Rays
@@ -261,7 +261,44 @@ def test_the_eikonal_term_is_of_the_slope_at_hits_and_anywhere(slope):
     terms = losses(eikonal=0.5)(RENDERERS["dvr"], shape, meter, PIXELS)
     expected = 0.5 * 2 * (slope - 1) ** 2
     assert terms["eikonal"].item() == pytest.approx(expected, abs=1e-7)  # random points are in float32
-    assert meter.counts.value > EIKONAL_POINTS
+    assert meter.counts.value > CUBE_POINTS
+
+
+@each("slope", [1.0, 0.6])
+@each("rate", [2.0, 8.0])
+def test_the_heat_term_is_the_integral_over_the_cube(slope, rate, monkeypatch):
+    """Against a grid of the cube. Of a distance of slope 1, the integrand is exp(-2 rate |u|)."""
+    monkeypatch.setattr("bench.tasks.reconstruction.losses.CUBE_POINTS", 200_000)
+    torch.manual_seed(0)
+    shape = ball(slope=slope)
+    terms = losses(heat=3.0, heat_rate=rate)(RENDERERS["idr"], shape, Meter(shape), PIXELS)
+    axis = (torch.arange(80, dtype=torch.float64) + 0.5) / 40 - 1
+    grid = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1)
+    expected = 3.0 * (-2 * rate * shape(grid).abs()).exp().mean().item() * (slope**2 + 1) / 2
+    assert set(terms) == {"total", "heat"} and terms["heat"].item() == pytest.approx(expected, rel=0.02)
+
+
+def test_the_heat_term_costs_a_value_and_a_gradient_per_point_and_a_level_set_has_none():
+    off, on = Meter(BALL), Meter(BALL)
+    losses(colour=1.0)(RENDERERS["idr"], BALL, off, PIXELS)
+    losses(colour=1.0, heat=1.0)(RENDERERS["idr"], BALL, on, PIXELS)
+    assert on.counts.value - off.counts.value == 2 * CUBE_POINTS
+    level = replace(BALL, kind=Kind.LEVEL)
+    terms = losses(colour=1.0, heat=1.0)(RENDERERS["dvr"], level, Meter(level), PIXELS)
+    assert set(terms) == {"total", "colour"}
+    with pytest.raises(ValueError, match=r"task\.losses\.heat_rate must be positive"):
+        losses(heat=1.0, heat_rate=0.0)
+
+
+def test_the_heat_term_is_least_for_a_distance_among_slopes():
+    """HotSpot: a field that is too flat keeps heat far from the surface; too steep a one has large gradients."""
+    torch.manual_seed(0)
+    values = []
+    for slope in (0.5, 1.0, 2.5):
+        shape = ball(slope=slope)
+        torch.manual_seed(0)
+        values.append(losses(heat=1.0)(RENDERERS["idr"], shape, Meter(shape), PIXELS)["heat"].item())
+    assert min(values) == values[1]
 
 
 def test_unknown_observations_have_no_term_and_the_total_is_the_sum():
