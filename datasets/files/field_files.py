@@ -20,7 +20,7 @@ from renderers.field import Field, Flops, Kind, Moved
 from renderers.fields.analytic import Shape
 from renderers.fields.grid import Grid
 from renderers.fields.mlp import BoundDecoder
-from renderers.fields.networks import coloured, encoded, network, occupancy, published
+from renderers.fields.networks import coloured, encoded, lipschitz, network, occupancy, published
 from renderers.fields.parts import Formula
 from renderers.fields.textured import TexturedShape
 
@@ -30,6 +30,7 @@ CLASSES: dict[str, type] = {
     for class_ in (
         *(BoundDecoder, Grid, Shape, Formula, Flops, Moved, network.Adjusted, network.AtCode),
         *(encoded.EncodedNetwork, encoded.FourierFeatures, encoded.HashGrid),
+        *(lipschitz.LipschitzNetwork, lipschitz.LipschitzLayer),
         *(coloured.ColouredDistance, coloured.ColouredGrid, coloured.OccupancyOf, coloured.ScaledOccupancyOf),
         TexturedShape,
         *(occupancy.BoundOccupancy, occupancy.OccupancyNetwork, occupancy.Block),

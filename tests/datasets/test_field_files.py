@@ -27,6 +27,7 @@ from renderers.fields.networks.coloured import (
     ScaledOccupancyOf,
 )
 from renderers.fields.networks.encoded import EncodedNetwork, FourierFeatures, HashGrid
+from renderers.fields.networks.lipschitz import LipschitzNetwork
 from renderers.fields.networks.network import Coded, Published
 from renderers.fields.networks.occupancy import OccupancyNetwork
 from renderers.fields.networks.published import Layered
@@ -64,6 +65,7 @@ FIELDS = {
     "hash": lambda: EncodedNetwork(
         HashGrid(numbers(2, 16, 2), (2, 4), 1.05), ((numbers(5, 7), numbers(5)), (numbers(1, 5), numbers(1)))
     ),
+    "lipschitz": lambda: LipschitzNetwork.new(2, 6, seed=1),
     "textured": lambda: TexturedDecoder(layers=2, width=8, code_length=4, skip=1, narrow=False).at(numbers(4)),
     "coloured_grid": lambda: ColouredGrid(samples=6, radius=0.5, reach=1.05),
     "occupancy": lambda: ColouredOccupancy(width=8, radius=0.5).field,
