@@ -11,6 +11,7 @@ experiment, after the others. An experiment sweeps over these renderers by `rend
 A choice of `method/space` declares the settings of a method that may be tuned; see `bench.setup.spaces`.
 """
 
+import pickle
 import re
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -64,19 +65,19 @@ class Choice:
         if self.row is not None:
             look = (LOOK_KEY,) if self.package else ()  # it would become a key of the top level
             return OmegaConf.create({key: self.row[key] for key in self.row if key not in look}), self.package
-        node, package = _load_file(self.path, _read_text(self.path))
+        content, package = _load_file(self.path, _read_text(self.path))
         if self.package is not None and package != self.package:
             raise ValueError(
                 f"{self.path} must begin with the line # @package {self.package}: its keys are those of the top level"
             )
-        return deepcopy(node), package
+        return pickle.loads(content), package
 
 
 @cache
-def _load_file(path: Path, text: str) -> tuple[DictConfig, str | None]:
-    """The content of a file, and the package named in its first line."""
+def _load_file(path: Path, text: str) -> tuple[bytes, str | None]:
+    """The pickled content of a file, since it is copied in less time, and the package named in its first line."""
     package_line = PACKAGE_LINE.match(text)
-    return _parse(path, text, OmegaConf.create), package_line and package_line[1]
+    return pickle.dumps(_parse(path, text, OmegaConf.create)), package_line and package_line[1]
 
 
 _choices: dict[str, dict[str, Choice]] = {}  # by group and name, of conf and the user's folders

@@ -4,10 +4,10 @@ A composition takes a tenth of a second. The values of a cell are set on a copy 
 values takes milliseconds; it is done once for all cells that differ only in `index` or `seed`.
 """
 
+import pickle
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -230,7 +230,7 @@ class Composer:
         self.run_overrides = [str(override.input_line) for override in self.overrides if override not in hydra]
         if swept := [override.key_or_group for override in hydra if override.is_sweep_override()]:
             raise ValueError(f"{swept[0]} has several values, but a sweep has one launcher: choose one")
-        self.composed: dict[tuple[str, ...], tuple[DictConfig, dict[str, Any]]] = {}
+        self.composed: dict[tuple[str, ...], tuple[bytes, dict[str, Any]]] = {}  # pickled, to be copied fast
         self.resolved_cells: dict[tuple[str, ...], ResolvedCells] = {}
         self.used_keys: set[str] = set()  # keys that at least one cell has
         self.lacking_keys: dict[str, DictConfig] = {}  # by key: a configuration without it
@@ -330,9 +330,10 @@ class Composer:
         overrides = [override for override in overrides if override.get_key_element() not in left_out]
         choices = tuple(str(override.input_line) for override in overrides if not sets_value(override))
         if choices not in self.composed:
-            self.composed[choices] = _split_off_choices(compose_choices([*self.hydra_choices, *choices]))
-        shared_config, names = self.composed[choices]
-        config = deepcopy(shared_config)
+            shared_config, names = _split_off_choices(compose_choices([*self.hydra_choices, *choices]))
+            self.composed[choices] = pickle.dumps(shared_config), names
+        content, names = self.composed[choices]
+        config = pickle.loads(content)
         for override in filter(sets_value, overrides):
             key = override.key_or_group
             if set_value(override, config):
