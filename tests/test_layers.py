@@ -2,6 +2,7 @@
 
 import ast
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -67,10 +68,10 @@ DATA_PACKAGES = ("bench.report", "bench.records", "bench.tables")
 REPORT_MAY = (COMMON, *DATA_PACKAGES, *PICTURES)
 
 
-def imported(tree: ast.AST, module: str, is_package: bool) -> set[str]:
+def imported(nodes: Iterable[ast.AST], module: str, is_package: bool) -> set[str]:
     """The dotted names of everything that a module imports, anywhere in it, relative imports resolved."""
     names = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -121,8 +122,8 @@ def upward(module: str, names: set[str]) -> list[str]:
 
 def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
     """The faults of a module's source."""
-    tree = ast.parse(source)
-    names = imported(tree, module, is_package) - {STUDIES}
+    nodes = [*ast.walk(ast.parse(source))]
+    names = imported(nodes, module, is_package) - {STUDIES}
     top = module.split(".")[0]
     messages = [f"imports {name}" for name in names if within(name, *FORBIDDEN.get(top, ()))]
     command = [name for name in names if ".__main__" in name or within(name, *COMMANDS)]
@@ -141,7 +142,7 @@ def wrongs(source: str, module: str, is_package: bool = False) -> list[str]:
         messages += [f"imports a study: {name}" for name in names if within(name, STUDIES)]
     if module == "bench":  # runs before every import of bench.report, and before torch may be imported
         messages += [f"imports {name}" for name in names if name.split(".")[0] not in sys.stdlib_module_names]
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.ImportFrom) and any(alias.name == "*" for alias in node.names):
             messages.append("has a star import")
         of_sys = isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "sys"

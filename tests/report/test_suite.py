@@ -451,24 +451,27 @@ def test_a_handicap_is_significant_and_a_twin_is_not_on_twelve_scenes(tmp_path, 
     assert (spent["Slow"][:, 1] > 2 + spent["Exact"][:, 1] / 2).all()
 
 
-def test_the_shipped_page_is_that_of_the_shipped_rows():
-    made_of = Standing(gather(SHIPPED, SHIPPED))
+@pytest.fixture(scope="module")
+def shipped_standing() -> Standing:
+    return Standing(gather(SHIPPED, SHIPPED))
+
+
+def test_the_shipped_page_is_that_of_the_shipped_rows(shipped_standing):
     shown = pd.read_csv(SHIPPED / "paper" / "suite.csv").set_index("row")
-    assert made_of.budgets
-    for budget, ranked in made_of.rankings.items():
+    assert shipped_standing.budgets
+    for budget, ranked in shipped_standing.rankings.items():
         assert shown[f"{budget:g}"].dropna().to_dict() == pytest.approx(ranked.progress, rel=1e-9)
         assert {row: str(shown.loc[row, f"{budget:g}_rank"]).removesuffix(".0") for row in ranked.progress} == {
             row: ranked.rank(row) for row in ranked.progress
         }
 
 
-def test_equal_rows_differ_in_at_most_one_of_twenty_draws():
+def test_equal_rows_differ_in_at_most_one_of_twenty_draws(shipped_standing):
     """The level of the shipped design at each budget: rows are centred in each set, and scenes are drawn anew."""
-    made_of = Standing(gather(SHIPPED, SHIPPED))
-    assert made_of.budgets
-    decided = [budget for budget, ranked in made_of.rankings.items() if ranked.decidable]
+    decided = [budget for budget, ranked in shipped_standing.rankings.items() if ranked.decidable]
+    complete = shipped_standing.complete
     assert decided
-    for _, runs in made_of.complete[made_of.complete["budget"].isin(decided)].groupby("budget"):
+    for _, runs in complete[complete["budget"].isin(decided)].groupby("budget"):
         assert 0 < simulated_level(runs, draws=500) <= MAX_LEVEL
 
 
