@@ -146,12 +146,24 @@ def cached_compositions() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def quick_pages() -> Iterator[None]:
-    """Draws figures of few pixels; their PDF files subset no font."""
-    from bench.pictures import figure_style
+    """Draws figures and pictures of few pixels; their PDF files subset no font."""
+    from bench.pictures import distances, figure_style
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(distances, "PIXELS", 140)  # per side of a view, as many as the figure then shows
         patch.setitem(figure_style.RC, "savefig.dpi", 60)
         patch.setitem(figure_style.RC, "pdf.fonttype", 3)
+        yield
+
+
+@pytest.fixture(scope="module")
+def few_samples() -> Iterator[None]:
+    """Compares the frames of two surfaces by fewer points."""
+    from datasets.files import coincidence
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(coincidence, "SAMPLES", (4000, 200))
+        patch.setattr(coincidence, "FAST_SAMPLES", (1500, 80))
         yield
 
 

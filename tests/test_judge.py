@@ -24,6 +24,7 @@ from tests.made_photographs import CENTRE as PHOTOGRAPHED
 from tests.made_photographs import RADIUS, idr
 
 FEW = ("--points", "4000")
+pytestmark = pytest.mark.usefixtures("few_samples")
 
 
 def judged(capsys, *arguments, code: int = 0) -> dict[str, dict[str, float]]:

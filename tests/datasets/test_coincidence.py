@@ -70,7 +70,8 @@ def test_there_are_24_rotations_and_24_mirrors_and_the_commonest_is_first():
     lambda p: 0.6 * p / np.linalg.norm(p, axis=1, keepdims=True), lambda p: p + 0.1, lambda p: p * (1, 1, 0.6),
 ])  # fmt: skip
 def test_a_poor_or_partial_surface_is_no_other_frame(spoil, monkeypatch):
-    monkeypatch.setattr(coincidence, "SAMPLES", (10_000, 300))  # faster
+    monkeypatch.setattr(coincidence, "SAMPLES", (4000, 200))  # faster
+    monkeypatch.setattr(coincidence, "FAST_SAMPLES", (1500, 80))
     for is_partial in (False, True):
         assert not compare_surfaces(spoil(POINTS), POINTS, is_partial=is_partial).is_other_frame
         assert not compare_surfaces(POINTS, spoil(POINTS), is_partial=is_partial).is_other_frame

@@ -19,6 +19,7 @@ from tests.looped import each
 from tests.made_scans import RADIUS, TURNS, write_scans
 from tests.runner.driving import SMALLEST, command, record_of
 
+pytestmark = pytest.mark.usefixtures("few_samples")
 VIEWS = ViewSampler(distance=2.5, field_of_view=50.0, azimuth=(0.0, 360.0), elevation=(15.0, 35.0), resolution=48)
 EMPTY = b"ply\nformat ascii 1.0\nelement vertex 0\nproperty int x\nproperty int y\nproperty int z\nend_header\n"
 PARALLEL_VIEWS = replace(VIEWS, distance=20.0, field_of_view=6.2)  # nearly parallel rays, like those of the scanner

@@ -36,7 +36,8 @@ def test_surfaces_are_compared_in_both_directions():
     assert {*map(tuple, cloud.truth)} <= {*map(tuple, large.vertices)}
 
 
-def test_the_nearest_point_is_seen_and_gaps_between_points_close():
+def test_the_nearest_point_is_seen_and_gaps_between_points_close(monkeypatch):
+    monkeypatch.setattr("bench.pictures.distances.PIXELS", PIXELS)  # tests have fewer
     grid = np.stack(np.meshgrid(np.arange(-150, 150, 4.0), np.arange(-90, 90, 4.0)), axis=-1).reshape(-1, 2)
     near, far = (np.column_stack([grid, np.full(len(grid), depth)]) for depth in (10.0, 90.0))
     index, depth = _splat(np.concatenate([far, near, [[1e6, 0, 0]]]))
