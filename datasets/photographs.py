@@ -11,13 +11,14 @@ from datasets.scene import Truth, see
 from datasets.shot import Shot
 from datasets.textures import ONE_COLOUR, TEXTURES, Texture, make_texture
 from datasets.views import look_at
-from renderers.camera import Camera
+from renderers.camera import Camera, sphere_span
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 
 SUPERSAMPLING = 2  # rays per pixel and axis
 LIGHT_DIRECTION = (0.4, 0.8, 0.45)  # towards the light, in world axes
 AMBIENT_FRACTION = 0.4  # the rest of the light comes from LIGHT_DIRECTION
 BACKGROUND_GREY = 0.5
+ROOM_RADIUS, ROOM_TEXTURE_SIZE = 4.0, 1.5  # scene units
 MAX_ELEVATION_DEGREES = 60.0
 ARC_HALF_ANGLE_DEGREES = 45.0
 MIN_COLOUR_SPREAD = 1e-3  # interquartile range of a surface's colours; images of fewer colours cannot be matched
@@ -35,7 +36,7 @@ class Photography:
         texture: one of `datasets.textures.TEXTURES`.
         texture_size: of the texture's largest parts, in scene units; see `datasets.textures.make_texture`.
         shading: "unlit": the texture's colours; "lambertian": under a fixed light.
-        background: "grey", or "noise" that differs between views, like a distant background.
+        background: "grey"; "noise" that differs between views; or "room", a texture on a sphere around the cameras.
         noise: standard deviation of each colour's noise.
         blur: standard deviation of a Gaussian, in pixels.
         exposure: standard deviation of the logarithm of each view's exposure.
@@ -57,7 +58,7 @@ class Photography:
         check_choice("texture", self.texture, TEXTURES)
         check_positive("texture_size", self.texture_size, "0.3 works for noise, 2 for a photograph")
         check_choice("shading", self.shading, ("unlit", "lambertian"))
-        check_choice("background", self.background, ("grey", "noise"))
+        check_choice("background", self.background, ("grey", "noise", "room"))
         if self.texture in ONE_COLOUR and self.shading == "unlit":
             raise ValueError("a texture of one colour without shading has nothing to compare: set shading=lambertian")
         for name in ("noise", "blur", "exposure"):
@@ -93,6 +94,9 @@ class Photography:
         colours = np.full((len(origins), 3), BACKGROUND_GREY)
         if self.background == "noise":
             colours = generator.random((len(origins), 3))
+        if self.background == "room":
+            walls = rays.at(sphere_span(rays, ROOM_RADIUS)[1]).numpy().astype(float)
+            colours = make_texture("noise", ROOM_TEXTURE_SIZE, len(origins))(walls, -walls / ROOM_RADIUS)
         points = origins[hits.hit] + hits.distance[hits.hit, None] * directions[hits.hit]
         normals = hits.normals[hits.hit].astype(float)
         light = np.array(LIGHT_DIRECTION) / np.linalg.norm(LIGHT_DIRECTION)

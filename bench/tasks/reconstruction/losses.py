@@ -8,6 +8,7 @@ from torch import Tensor
 
 from bench.solve.latent_code import Terms, total
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, gradients_at, normal_error
+from bench.tasks.reconstruction.background import Background
 from bench.tasks.reconstruction.pixels import Pixels
 from renderers.boundary import render_checked
 from renderers.camera import Rays
@@ -78,7 +79,14 @@ class Losses:
         for name in weights:
             check_at_least(f"task.losses.{name}", getattr(self, name), 0, "0 switches the term off")
 
-    def __call__(self, renderer: Renderer, shape: Coloured, metered: Meter, pixels: Pixels) -> Terms:
+    def __call__(
+        self,
+        renderer: Renderer,
+        shape: Coloured,
+        metered: Meter,
+        pixels: Pixels,
+        background: Background | None = None,
+    ) -> Terms:
         """The weighted terms and their sum, `total`.
 
         Args:
@@ -86,6 +94,7 @@ class Losses:
             shape: the field, with gradients for its parameters.
             metered: the same field with counted evaluations.
             pixels: the compared pixels; for `colour_gradient` in groups of four, see `Stack.draw`.
+            background: the colours behind the shape. With it, colours are compared along all rays, without masks.
         """
         rendering = render_checked(renderer, metered, pixels.rays)
         inside = rendering.hit if pixels.mask is None else rendering.hit & pixels.mask
@@ -93,16 +102,27 @@ class Losses:
         gradients = gradients_at(metered, points)
         normals = torch.nn.functional.normalize(gradients, dim=-1)
         terms: Terms = {}
-        if (self.colour or self.colour_gradient) and rendering.volume is not None and pixels.mask is None:
-            raise BadInput(f"{type(renderer).__name__} needs masks: without them it would paint what is behind too")
+        needs_masks = rendering.volume is not None and pixels.mask is None and background is None
+        if (self.colour or self.colour_gradient) and needs_masks:
+            reason = "needs masks: without them it would paint what is behind too"
+            raise BadInput(f"{type(renderer).__name__} {reason}; +task.background=sphere learns what is behind")
         if self.colour and self.colour_of == SAMPLES:
             if rendering.volume is None:
                 raise BadInput(f"{type(renderer).__name__} has no samples: take task.losses.colour_of=blended")
+            if pixels.mask is None:
+                raise BadInput("task.losses.colour_of=samples needs masks: take colour_of=blended")
             errors = _sample_errors(shape, metered, pixels, rendering.volume)[pixels.mask]
             terms["colour"] = self.colour * errors.sum() / rays
         elif self.colour or self.colour_gradient:
             if rendering.volume is None:
                 compared, colours = inside, shape.colours(points, gradients, pixels.rays.directions[inside])
+                if background is not None:
+                    compared = torch.ones_like(inside)
+                    colours = background(pixels.rays).index_put((inside,), colours)
+            elif background is not None:
+                compared, opacity = torch.ones_like(inside), rendering.opacity[:, None]
+                colours = _volume_colours(shape, metered, pixels.rays, rendering.volume)
+                colours = colours + (1 - opacity) * background(pixels.rays)
             else:
                 compared = pixels.mask
                 colours = _volume_colours(shape, metered, pixels.rays, rendering.volume)[compared]

@@ -15,6 +15,7 @@ from bench.evaluate.state import State
 from bench.pictures.filmstrip import Shown
 from bench.solve.latent_code import Terms
 from bench.solve.pixel_draw import generator_of
+from bench.tasks.reconstruction.background import OneColour, OutsideSphere
 from bench.tasks.reconstruction.cameras import CameraMotions
 from bench.tasks.reconstruction.judge import field_scores, judge, surface_scores
 from bench.tasks.reconstruction.losses import Losses
@@ -29,6 +30,7 @@ from renderers.fields.networks.coloured import ColouredDistance, ColouredGrid, C
 from renderers.rendering import Renderer, at_iteration
 
 OBJECTIVE_PIXELS = 4096  # compared before and after the optimisation
+Behind = OneColour | OutsideSphere
 Learnt = ColouredDistance | ColouredOccupancy | ColouredGrid  # modules whose `field` is a Coloured
 
 
@@ -45,11 +47,13 @@ class ReconstructionProblem:
     iterations: int
     seed: int
     motions: CameraMotions
+    background: Behind | None = None
     counts: Counts = field(default_factory=Counts)
 
     @property
     def parameters(self) -> list[Tensor]:
-        return [*self.model.parameters(), *([self.motions.numbers] if self.motions.learnt else [])]
+        more = [] if self.background is None else self.background.parameters()
+        return [*self.model.parameters(), *more, *([self.motions.numbers] if self.motions.learnt else [])]
 
     @property
     def tracked(self) -> tuple[str, ...]:
@@ -96,7 +100,8 @@ class ReconstructionProblem:
         seed = generator_of(self.seed, iteration).initial_seed()
         pixels = self.motions.apply(self.stack.draw(self.rays_per_iteration, patches=patches, seed=seed))
         shape = self.model.field
-        return self.losses(at_iteration(self.renderer, iteration), shape, Meter(shape, self.counts), pixels)
+        renderer = at_iteration(self.renderer, iteration)
+        return self.losses(renderer, shape, Meter(shape, self.counts), pixels, self.background)
 
     def objective(self) -> float:
         """The mean difference of colours over a fixed set of input pixels.
@@ -107,12 +112,14 @@ class ReconstructionProblem:
         return float(self.colour_errors(self.motions.apply(pixels)).mean())
 
     def colour_errors(self, pixels: Pixels) -> Float[Tensor, " n"]:
-        """The mean difference of the three colours of each pixel, black outside of the shape and of masks."""
+        """The mean difference of the three colours of each pixel; outside of the shape the background, else black."""
         shape = self.field()
         with torch.no_grad():
             rendering = render_checked(at_iteration(self.renderer, self.iterations), shape, pixels.rays)
         true_colours = pixels.colours if pixels.mask is None else pixels.colours * pixels.mask[:, None]
-        rendered_colours = torch.zeros_like(true_colours)
+        with torch.no_grad():
+            behind = torch.zeros_like(true_colours) if self.background is None else self.background(pixels.rays)
+        rendered_colours = behind
         points, directions = rendering.points[rendering.hit], pixels.rays.directions[rendering.hit]
         rendered_colours[rendering.hit] = colours_at(shape, points, directions, points.device).to(true_colours)
         return (rendered_colours - true_colours).abs().mean(dim=-1)

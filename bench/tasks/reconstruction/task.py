@@ -10,6 +10,7 @@ from bench.evaluate.state import State
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import OptimiserSettings, with_affordable_rays
 from bench.solve.solve import check_field_gradient, solve_and_draw
+from bench.tasks.reconstruction import background as behind
 from bench.tasks.reconstruction import cameras
 from bench.tasks.reconstruction.choice import DEFINITIONS, Appearance, AutoField
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, judge
@@ -54,6 +55,8 @@ class Reconstruction(PhotographTask):
         cameras: "given", or "refine": a rigid motion of each camera but the first is learnt with the shape.
         camera_noise: degrees by which each input camera but the first is wrong, about a random axis through the origin.
             None: 0, and the errors of cameras are not measured.
+        background: what rays see that pass the object, for photographs without masks: "none", "black", "grey", "white",
+            or "sphere", which learns it; see `bench.tasks.reconstruction.background.OutsideSphere`.
     """
 
     guide: str
@@ -65,6 +68,7 @@ class Reconstruction(PhotographTask):
     pixel_block: int = 1
     cameras: str = cameras.GIVEN
     camera_noise: float | None = None
+    background: str = behind.NONE
 
     takes_field: ClassVar[bool] = True
 
@@ -74,6 +78,11 @@ class Reconstruction(PhotographTask):
         check_at_least("task.pixel_block", self.pixel_block, 0, "2 draws a quarter of task.rays")
         check_at_least("task.rays", self.rays, 4, "1024 work")
         check_choice("task.cameras", self.cameras, cameras.CHOICES)
+        check_choice("task.background", self.background, behind.CHOICES)
+        if self.background != behind.NONE and self.masks:
+            raise ValueError(
+                f"task.background={self.background} is for photographs without masks: set task.masks=false"
+            )
         check_at_least("task.camera_noise", self.camera_noise or 0, 0, "0 keeps the cameras")
         if self.losses.colour_gradient and self.rays % 4:
             raise ValueError(f"task.rays must be a multiple of 4 for patches of 2 x 2 pixels, not {self.rays}: 1024")
@@ -129,7 +138,9 @@ class Reconstruction(PhotographTask):
         def problem(task: Reconstruction) -> ReconstructionProblem:
             rays = max(self.rays // task.pixel_block**2, 4)
             motions = cameras.CameraMotions(shots, true, self.cameras == cameras.REFINE, inputs.device)
-            args = self.losses, inputs.renderer, rays, iterations, inputs.seed, motions
+            background = behind.make(self.background)
+            learnt_background = None if background is None else background.to(inputs.device)
+            args = self.losses, inputs.renderer, rays, iterations, inputs.seed, motions, learnt_background
             return ReconstructionProblem(subject, stack, model, *args)
 
         return with_affordable_rays(self, problem)

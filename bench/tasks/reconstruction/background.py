@@ -1,0 +1,71 @@
+"""What rays see that pass the object, for photographs without masks."""
+
+from math import pi
+from typing import Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import softplus
+
+from renderers.camera import Rays, distance_to_origin
+from renderers.fields.networks.coloured import positional_encoding
+
+NONE, SPHERE = "none", "sphere"
+GREYS = {"black": 0.0, "grey": 0.5, "white": 1.0}
+CHOICES = (NONE, *GREYS, SPHERE)
+WIDTH, OCTAVES, SAMPLES = 64, 4, 16  # of the network outside of the unit sphere, and its samples per ray
+
+
+class Background(Protocol):
+    """The colours behind the object."""
+
+    def __call__(self, rays: Rays) -> Float[Tensor, "n 3"]:
+        """RGB from 0 to 1 along n rays."""
+        ...
+
+
+class OneColour(nn.Module):
+    """A background of one grey value."""
+
+    def __init__(self, grey: float) -> None:
+        super().__init__()
+        self.grey = grey
+
+    def forward(self, rays: Rays) -> Float[Tensor, "n 3"]:
+        return torch.full_like(rays.directions, self.grey)
+
+
+class OutsideSphere(nn.Module):
+    """A radiance field outside of the unit sphere, of direction and inverse radius; opaque at infinity.
+
+    Source: the inverted sphere of NeRF++ (Zhang et al. 2020, arXiv 2010.07492), Sec. 4, as NeuS without masks.
+    Deviates: two hidden layers; colours do not depend on the view direction; the samples of a ray are evenly spaced in
+        inverse radius, from where it leaves the sphere or, if it misses the sphere, passes nearest to the origin.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers = [nn.Linear(4 + 8 * OCTAVES, WIDTH), nn.Softplus(), nn.Linear(WIDTH, WIDTH), nn.Softplus()]
+        self.network = nn.Sequential(*layers, nn.Linear(WIDTH, 4))
+
+    def forward(self, rays: Rays) -> Float[Tensor, "n 3"]:
+        nearest = distance_to_origin(rays)
+        approach = -(rays.origins * rays.directions).sum(-1)
+        share = (torch.arange(SAMPLES, dtype=nearest.dtype, device=nearest.device) + 0.5) / SAMPLES
+        inverse_radius = (1 - share) / nearest.clamp_min(1.0)[:, None]
+        half_chord = (inverse_radius.pow(-2) - nearest.square()[:, None]).clamp_min(1e-6).sqrt()
+        directions = rays.at_each(approach[:, None] + half_chord) * inverse_radius[..., None]
+        encoded = positional_encoding(torch.cat([directions, inverse_radius[..., None]], dim=-1) * pi / 2, OCTAVES)
+        density, colours = self.network(encoded).split([1, 3], dim=-1)
+        transparency = (-softplus(density[..., 0])).exp()
+        transparency = torch.cat([transparency[:, :-1], torch.zeros_like(transparency[:, -1:])], dim=-1)
+        passing = torch.nn.functional.pad(transparency[:, :-1], (1, 0), value=1.0).cumprod(-1)
+        return ((passing * (1 - transparency))[..., None] * colours.sigmoid()).sum(1)
+
+
+def make(name: str) -> OneColour | OutsideSphere | None:
+    """The background of a name in `CHOICES`; None for "none"."""
+    if name == SPHERE:
+        return OutsideSphere()
+    return None if name == NONE else OneColour(GREYS[name])
