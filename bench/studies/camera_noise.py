@@ -2,7 +2,7 @@
 
 from bench.report.study import Runs, Selection, condition_curves
 
-PLACE = 46
+PLACE = 47
 NOISE = "task.camera_noise"
 READS = (Selection("camera_noise", (NOISE,)),)
 NOTES = [

@@ -14,7 +14,7 @@ from renderers.fields.networks.coloured import positional_encoding
 NONE, SPHERE = "none", "sphere"
 GREYS = {"black": 0.0, "grey": 0.5, "white": 1.0}
 CHOICES = (NONE, *GREYS, SPHERE)
-WIDTH, OCTAVES, SAMPLES = 64, 4, 16  # of the network outside of the unit sphere, and its samples per ray
+NETWORK_WIDTH, NETWORK_OCTAVES, SAMPLES_PER_RAY = 64, 4, 16
 
 
 class Background(Protocol):
@@ -46,17 +46,24 @@ class OutsideSphere(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        layers = [nn.Linear(4 + 8 * OCTAVES, WIDTH), nn.Softplus(), nn.Linear(WIDTH, WIDTH), nn.Softplus()]
-        self.network = nn.Sequential(*layers, nn.Linear(WIDTH, 4))
+        layers = [
+            nn.Linear(4 + 8 * NETWORK_OCTAVES, NETWORK_WIDTH),
+            nn.Softplus(),
+            nn.Linear(NETWORK_WIDTH, NETWORK_WIDTH),
+            nn.Softplus(),
+        ]
+        self.network = nn.Sequential(*layers, nn.Linear(NETWORK_WIDTH, 4))
 
     def forward(self, rays: Rays) -> Float[Tensor, "n 3"]:
         nearest = distance_to_origin(rays)
         approach = -(rays.origins * rays.directions).sum(-1)
-        share = (torch.arange(SAMPLES, dtype=nearest.dtype, device=nearest.device) + 0.5) / SAMPLES
+        share = (torch.arange(SAMPLES_PER_RAY, dtype=nearest.dtype, device=nearest.device) + 0.5) / SAMPLES_PER_RAY
         inverse_radius = (1 - share) / nearest.clamp_min(1.0)[:, None]
         half_chord = (inverse_radius.pow(-2) - nearest.square()[:, None]).clamp_min(1e-6).sqrt()
         directions = rays.at_each(approach[:, None] + half_chord) * inverse_radius[..., None]
-        encoded = positional_encoding(torch.cat([directions, inverse_radius[..., None]], dim=-1) * pi / 2, OCTAVES)
+        encoded = positional_encoding(
+            torch.cat([directions, inverse_radius[..., None]], dim=-1) * pi / 2, NETWORK_OCTAVES
+        )
         density, colours = self.network(encoded).split([1, 3], dim=-1)
         transparency = (-softplus(density[..., 0])).exp()
         transparency = torch.cat([transparency[:, :-1], torch.zeros_like(transparency[:, -1:])], dim=-1)
