@@ -111,7 +111,8 @@ def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32) -> float
     """Best rate of a matrix product on this device with the current threads, in operations per second."""
     small = device.type == "cpu" and torch.get_num_threads() <= MAX_SMALL_GEMM_THREADS
     side = SMALL_GEMM_SIDE if small else GEMM_SIDE
-    matrix = torch.rand(side, side, device=device).to(dtype)
+    draw = torch.Generator(device).manual_seed(0)  # a draw of the default generator would change the run's result
+    matrix = torch.rand(side, side, generator=draw, device=device).to(dtype)
     least_seconds = float("inf")
     for _ in range(GEMM_REPEATS):
         stopwatch = Stopwatch(device)

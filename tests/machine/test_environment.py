@@ -155,3 +155,12 @@ def test_a_stopwatch_reads_the_clock_on_a_cpu_and_events_of_a_gpu(monkeypatch):
 def test_coarse_operations_take_float32s_rate_where_bfloat16_has_none():
     assert environment.seconds_at_peak({"gemm_peak_flops": 10.0, "bfloat16_peak_flops": 30.0}, 20, 30) == 3.0
     assert environment.seconds_at_peak({"gemm_peak_flops": 10.0, "bfloat16_peak_flops": None}, 20, 30) == 5.0
+
+
+def test_a_measurement_of_the_machine_changes_no_draw_of_a_run():
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    torch.manual_seed(0)
+    for dtype in (torch.float32, torch.bfloat16):
+        environment.gemm_peak(torch.device("cpu"), dtype)
+    assert torch.equal(torch.rand(3), expected)
