@@ -98,9 +98,7 @@ class ConditionCurves:
             groups = {value: group.set_index(SHAPE).sort_index() for value, group in row.groupby("value")}
             for value, group in groups.items():
                 estimates = {each.key: _median(group[each.key]) for each in self.measures}
-                first, key = groups.get(self.first), self.measures[0].key
-                paired = value != self.first and first is not None and first.index.equals(group.index)
-                gain = statistics.ratio(_shapes(group[key]), _shapes(first[key])) if paired else None
+                gain = None if value == self.first else self._gain(group, groups.get(self.first))
                 lines.append(
                     {
                         **{"name": name, "preset": preset, "value": value, "shapes": len(group)},
@@ -110,6 +108,12 @@ class ConditionCurves:
                     }
                 )
         return lines
+
+    def _gain(self, group: pd.DataFrame, first: pd.DataFrame | None) -> statistics.Interval | None:
+        """The ratio of the first measure to that at the first value, on the common shapes; None without any."""
+        common = group.index[:0] if first is None else group.index.intersection(first.index)
+        key = self.measures[0].key
+        return statistics.ratio(*(_shapes(each.loc[common][key]) for each in (group, first))) if len(common) else None
 
     def _verdict(self, lines: list[Line]) -> str:
         """The ratio of each row at the compared value, and whether it is significant."""
