@@ -16,6 +16,7 @@ PICTURE_TEXTS = {
     "film.webp": "The way from the start to the end, moving",
     "curve.png": "Loss and error over the iterations",
     "input.png": "What was given",
+    "outline.png": "The part of each pixel that the shape covers: result, truth and difference",
     "distances.png": "Mesh and truth, coloured by the distance to the other",
     "failure.png": "The first failure: kinds of pixels, beside the true distance",
 }
