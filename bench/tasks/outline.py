@@ -84,6 +84,6 @@ def draw(path: Path, shown: Float[Tensor, "height width"], true: Float[Tensor, "
         axis.set_title(title)
     figure.colorbar(drawn, ax=axes[:2], label="covered fraction of the pixel", shrink=0.8)
     drawn = bare(axes[2]).imshow(error, cmap="RdBu_r", vmin=-1, vmax=1, interpolation="nearest")
-    axes[2].set_title(f"after minus truth: {torch.sum(error.abs()):.1f} pixels wrong")
+    axes[2].set_title(f"after - truth: {torch.sum(error.abs()):.1f} pixels")
     figure.colorbar(drawn, ax=axes[2], label="blue: too small, red: too large", shrink=0.8)
     save(figure, path)
