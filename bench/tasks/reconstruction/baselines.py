@@ -1,7 +1,7 @@
 """Surfaces from photographs without a renderer: baselines for `reconstruction`."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,18 +27,27 @@ class _Surface(PhotographTask):
 
     def execute(self, run: RunContext) -> None:
         """Computes the surface of the input photographs with their colours, and evaluates it on the held-out ones."""
-        record = run.record
-        record.definitions = COLOURED_DEFINITIONS | COST_DEFINITIONS
         subject = self.subject(run.inputs)
-        record.notes = [*record.notes, subject.summary, "no renderer took part"]
-        with run.on_clock():
-            surface = self.surface(subject)
-            mesh = None if surface is None else surface.cut_off()
-            mesh = None if mesh is None else with_colours(mesh, subject.input_shots)
-        record.evaluations = {"value": 0, "gradient": 0}
-        with run.off_clock():
-            note_surface(run, mesh, subject, {})
+        note_baseline(run, subject, lambda: self.surface(subject))
         subject.finish(run)
+
+
+def note_baseline(run: RunContext, subject: Subject, surface: Callable[[], Mesh | None]) -> None:
+    """Times a surface that no renderer computes, and evaluates it with the colours of the input photographs.
+
+    Args:
+        surface: computes the surface in the unit sphere; None if there is none.
+    """
+    record = run.record
+    record.definitions = COLOURED_DEFINITIONS | COST_DEFINITIONS
+    record.notes = [*record.notes, subject.summary, "no renderer took part"]
+    with run.on_clock():
+        mesh = surface()
+        mesh = None if mesh is None else mesh.cut_off()
+        mesh = None if mesh is None else with_colours(mesh, subject.input_shots)
+    record.evaluations = {"value": 0, "gradient": 0}
+    with run.off_clock():
+        note_surface(run, mesh, subject, {})
 
 
 @dataclass(frozen=True)
