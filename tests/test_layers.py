@@ -30,8 +30,8 @@ PACKAGES = (
     "runner", "clusters", "report", "studies",
 )  # fmt: skip
 COMMANDS = (
-    "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.ray", "bench.suite", "bench.train",
-    "bench.tune", "bench.turntable", "bench.verify",
+    "bench.external", "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.ray", "bench.suite",
+    "bench.train", "bench.tune", "bench.turntable", "bench.verify",
 )  # fmt: skip
 # Three layers: a file imports only from its layer and the layers below. Files that are not listed are the core.
 DATA_LAYER = (
@@ -47,8 +47,8 @@ STUDIES_LAYER = (
     "bench.setup.auto", "bench.setup.colour_codes", "bench.setup.spaces",
     "bench.tasks.baselines", "bench.tasks.capacity", "bench.tasks.gradients", "bench.tasks.reconstruction",
     "bench.tasks.single_view", "bench.tasks.stability",
-    "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.ray", "bench.suite", "bench.train",
-    "bench.tune", "bench.turntable", "bench.verify",
+    "bench.external", "bench.judge", "bench.merge", "bench.photos", "bench.prior", "bench.ray", "bench.suite",
+    "bench.train", "bench.tune", "bench.turntable", "bench.verify",
 )  # fmt: skip
 LISTS = ("bench", "bench.__main__", "renderers")  # import from all layers, to list what there is
 MAX_CORE_LINES = 13_000
