@@ -195,6 +195,24 @@ def test_an_unknown_recipe_and_an_unknown_key_are_named_with_the_nearest(changed
             read_recipe(changed(**keys))
 
 
+def test_arguments_of_the_code_and_defaults_are_passed_on(code, monkeypatch):
+    called = []
+    monkeypatch.setattr(subprocess, "call", lambda words: called.append(words[2:]) or 1)
+    recipe = code / "recipe.yaml"
+    assert main([str(recipe), "code=a", "time_limit=5", "results_dir=b", "seed=1"]) == 1
+    (_, *words), report = called
+    given = ["task.code=a", "task.time_limit=5", "results_dir=b", "seed=1", "+experiment=photos", "rerun=failed"]
+    assert {*given, "task=external", "time_limit=null", f"task.path='{recipe}'"} < {*words}
+    assert report == ["bench.report", "results_dir=b"]
+    main([str(recipe), "rerun=all", "+experiment=fitted"])
+    assert [word for word in called[2] if "rerun" in word or "experiment" in word] == [
+        "rerun=all",
+        "+experiment=fitted",
+    ]
+    monkeypatch.setattr(subprocess, "call", lambda words: called.append(words) or 2)
+    assert main([str(recipe), "sede=1"]) == 2 and len(called) == 5  # a mistake: no report
+
+
 def test_another_commit_a_missing_code_and_missing_masks_are_refused(code, changed, tmp_path):
     with pytest.raises(
         ValueError, match=r"is at commit \w{40}, and the recipe is for 1234567: type git -C \S+ checkout"
