@@ -115,7 +115,7 @@ class External(PhotographTask):
     path: str | None = None
     code: str | None = None
     python: str | None = None
-    container: tuple[str, ...] | None = None
+    container: list[str] | None = None
     time_limit: float | None = None
 
     def check(self, inputs: RunInputs) -> None:
