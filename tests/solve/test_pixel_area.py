@@ -76,6 +76,13 @@ def test_the_gradient_of_the_area_is_that_of_the_outline_with_16_rays(name):
     assert float(torch.stack(slopes).mean()) == pytest.approx(expected, rel=0.1)
 
 
+def test_with_a_ray_per_pixel_the_band_is_mostly_missed_and_the_area_has_no_gradient():
+    radius = torch.tensor(RADIUS, requires_grad=True)
+    opacity = load("renderer", "relaxed_boundary").render(sphere(radius), random_rays(CAMERA, 1, 0, 0)).opacity
+    expected = (true_area(RADIUS + 1e-3) - true_area(RADIUS - 1e-3)) / 2e-3
+    assert abs(torch.autograd.grad(opacity.sum(), radius)[0].item()) < 0.1 * expected
+
+
 def test_the_area_loss_falls_to_zero_at_the_true_fraction_and_needs_an_opacity():
     rays = random_rays(CAMERA, 4, 0, 0)
     rendering = load("renderer", "relaxed_boundary").render(sphere(RADIUS), rays)
