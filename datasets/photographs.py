@@ -19,6 +19,7 @@ LIGHT_DIRECTION = (0.4, 0.8, 0.45)  # towards the light, in world axes
 AMBIENT_FRACTION = 0.4  # the rest of the light comes from LIGHT_DIRECTION
 BACKGROUND_GREY = 0.5
 ROOM_RADIUS, ROOM_TEXTURE_SIZE = 4.0, 1.5  # scene units
+ROOM_SEED = 0
 MAX_ELEVATION_DEGREES = 60.0
 ARC_HALF_ANGLE_DEGREES = 45.0
 MIN_COLOUR_SPREAD = 1e-3  # interquartile range of a surface's colours; images of fewer colours cannot be matched
@@ -96,7 +97,7 @@ class Photography:
             colours = generator.random((len(origins), 3))
         if self.background == "room":
             walls = rays.at(sphere_span(rays, ROOM_RADIUS)[1]).numpy().astype(float)
-            colours = make_texture("noise", ROOM_TEXTURE_SIZE, len(origins))(walls, -walls / ROOM_RADIUS)
+            colours = make_texture("noise", ROOM_TEXTURE_SIZE, ROOM_SEED)(walls, -walls / ROOM_RADIUS)
         points = origins[hits.hit] + hits.distance[hits.hit, None] * directions[hits.hit]
         normals = hits.normals[hits.hit].astype(float)
         light = np.array(LIGHT_DIRECTION) / np.linalg.norm(LIGHT_DIRECTION)

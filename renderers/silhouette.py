@@ -185,7 +185,9 @@ class Area:
     ) -> Float[Tensor, ""]:
         if rendering.volume is None:
             name = type(renderer).__name__
-            raise Unsupported(f"{name} has no opacity with a gradient, which silhouette=area needs: set silhouette=own")
+            raise Unsupported(
+                f"{name} has no opacity with a gradient, which silhouette=area needs: take silhouette=own, or neus"
+            )
         if observed.covered is None:
             return self.weight * (rendering.opacity - observed.mask.to(rays.origins.dtype)).square().mean()
         return self.weight * (rendering.opacity.mean(-1) - observed.covered).square().mean()

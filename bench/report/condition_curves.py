@@ -26,11 +26,12 @@ Line = dict[str, Any]
 
 @dataclass(frozen=True)
 class Measure:
-    """A metric of a page: its column of a run, its heading, and a factor."""
+    """A metric of a page: its column of a run, its heading, a factor, and the value of a run without it."""
 
     key: str
     heading: str
     factor: float = 1.0
+    failed: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,13 @@ class ConditionCurves:
         heading: of the condition.
         first: the value that the verdict and the ratios compare with.
         compared: the value of the verdict.
-        measures: the metrics. Ratios and the verdict are of the first. A run without the metric counts as infinite;
-            one that ended without progress counts with its result.
+        measures: the metrics. Ratios and the verdict are of the first. A run that ended without progress counts with
+            its result.
         title, question, verdict: text; `verdict` begins the sentence with the ratios.
         notes: of the runs.
         absent: the value of the condition in runs without the key.
+        reference: preset of the row with which the verdict compares the others at `compared`; empty: each row is
+            compared with itself at `first`.
     """
 
     condition: str
@@ -59,22 +62,24 @@ class ConditionCurves:
     verdict: str
     notes: Callable[[Runs], list[str]]
     absent: float = 0.0
+    reference: str = ""
 
     def __call__(self, runs: Runs) -> Result:
         """A line per row and value of the condition, over all shapes."""
         runs = runs.executed
         values = runs.number(f"config.{self.condition}").fillna(self.absent)
-        metrics = {each.key: each.factor * runs.number(each.key).fillna(np.inf) for each in self.measures}
+        metrics = {each.key: each.factor * runs.number(each.key).fillna(each.failed) for each in self.measures}
         frame = runs.frame[[*SHAPE, "row", "preset"]].assign(
             value=values, cost=runs.number("evaluations_cost"), **metrics
         )
         lines = self._lines(frame)
+        compared = self._against_reference(frame) if self.reference else self._over_first(lines)
         return Result(
             runs,
             self.title,
             f"{self.measures[0].heading}, over {self.heading.lower()}.",
             question=self.question,
-            verdict=self._verdict(lines),
+            verdict=self._verdict(compared),
             interval="95 % intervals over shapes (of the sign test)",
             remarks=[*self.notes(runs), NOTE],
             columns=self._columns(),
@@ -115,13 +120,27 @@ class ConditionCurves:
         key = self.measures[0].key
         return statistics.ratio(*(_shapes(each.loc[common][key]) for each in (group, first))) if len(common) else None
 
-    def _verdict(self, lines: list[Line]) -> str:
-        """The ratio of each row at the compared value, and whether it is significant."""
+    def _over_first(self, lines: list[Line]) -> dict[str, statistics.Interval]:
+        """The ratio of each row at the compared value to the row at the first value."""
         compared = [line for line in lines if line["value"] == self.compared and line["gain"] is not None]
-        verdicts = statistics.ratio_verdicts([line["gain"] for line in compared])
+        return {line["name"]: line["gain"] for line in compared}
+
+    def _against_reference(self, frame: pd.DataFrame) -> dict[str, statistics.Interval]:
+        """The ratio of each other row to the reference row, at the compared value."""
+        rows = {names: group for names, group in frame[frame.value == self.compared].groupby(["row", "preset"])}
+        groups = {names: group.set_index(SHAPE).sort_index() for names, group in rows.items()}
+        reference = next((group for (_, preset), group in groups.items() if preset == self.reference), None)
+        gains = {
+            name: self._gain(group, reference) for (name, preset), group in groups.items() if preset != self.reference
+        }
+        return {name: gain for name, gain in gains.items() if gain is not None}
+
+    def _verdict(self, ratios: dict[str, statistics.Interval]) -> str:
+        """The ratios, and whether each is significant."""
+        verdicts = statistics.ratio_verdicts([*ratios.values()])
         parts = [
-            f"{line['name']} *{format.number(line['ratio'])}*{VERDICTS.get(verdict, UNCHANGED)}"
-            for line, verdict in zip(compared, verdicts, strict=True)
+            f"{name} *{format.number(ratio.value)}*{VERDICTS.get(verdict, UNCHANGED)}"
+            for (name, ratio), verdict in zip(ratios.items(), verdicts, strict=True)
         ]
         return f"{self.verdict}: {'; '.join(parts)}." if parts else ""
 

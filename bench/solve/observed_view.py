@@ -131,12 +131,18 @@ class ObservedView:
             mask=mask,
         ).to(device)
 
-    def with_area(self, scene: Scene, camera: Camera, seed: int) -> "ObservedView":
-        """The observations of the area of pixels, of the scene's true mesh, if the scene has several rays per pixel."""
-        if scene.rays_per_pixel == 1:
+    def with_area(self, scene: Scene, camera: Camera, seed: int, fractions: bool | None = None) -> "ObservedView":
+        """The observations of the area of pixels, of the scene's true mesh, if the scene has several rays per pixel.
+
+        Args:
+            fractions: whether a pixel's observation is the fraction that the shape covers, or 0 or 1 by its centre.
+                None: with several rays per pixel.
+        """
+        if scene.rays_per_pixel == 1 and not fractions:
             return self
         device = self.depth.device
         covered, depth = (image.to(device) for image in see_area(scene.raycaster, camera))
+        covered = scene.view.mask.to(covered) if fractions is False else covered
         camera = camera.to(device)
         rays_at = partial(random_rays, camera, scene.rays_per_pixel, seed)
         area = replace(self, depth=torch.where(self.observed, depth, 0.0), covered=covered)

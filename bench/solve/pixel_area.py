@@ -14,12 +14,7 @@ SEED_OF_RAYS = 7  # added to seeds, so that the rays of pixels do not follow the
 
 
 def random_rays(camera: Camera, count: int, seed: int, iteration: int) -> Rays:
-    """The rays of an iteration: of each pixel, a random one in each of `count` equal squares; with 1, its centre's.
-
-    Their shape is [height, width, count], with 1 [height, width].
-    """
-    if count == 1:
-        return camera.rays()
+    """The rays [height, width, count] of an iteration: a random one in each of `count` equal squares of each pixel."""
     side, shape = isqrt(count), (camera.height, camera.width, count, 2)
     corner = torch.cartesian_prod(torch.arange(side), torch.arange(side))
     inside = torch.rand(shape, generator=generator_of(seed + SEED_OF_RAYS, iteration))
@@ -39,12 +34,12 @@ def observation_of(
 ) -> RayObservation:
     """The observation of each ray [*pixels, rays] that changes fewest rays.
 
-    Losses of single rays need a mask. In a pixel that is covered by a fraction k of n rays, the foreground is the k
-    rays whose `closest` is smallest. Rays that hit are the first of them, so that the mask has no wrong ray if the
+    Losses of single rays need a mask. In a pixel that is covered by a fraction k of n rays, k rays are the foreground:
+    first rays that hit, in random order, then those whose `closest` is smallest. So the mask has no wrong ray if the
     right number hits.
     """
-    rays = rendering.closest.shape[-1]
-    order = torch.where(rendering.hit, -torch.inf, rendering.closest.detach())
+    rays, closest = rendering.closest.shape[-1], rendering.closest.detach()
+    order = torch.where(rendering.hit, closest.min() - 1 - torch.rand_like(closest), closest)
     rank = order.argsort(-1).argsort(-1)
     mask = rank < (covered * rays).round()[..., None]
     return RayObservation(mask, distance[..., None].expand_as(mask), covered)

@@ -9,7 +9,6 @@ NOTES = (
     f"{compare.RATIO} {compare.FAILURE}",
     "The cameras stand in a room with a texture, the same in all photographs. Rows without masks learn the room as a "
     "network of direction and inverse radius (`+task.background=sphere`), and compare the colours of all pixels.",
-    "Newton's surfaces have no gradient of visibility: without masks, nothing tells their outline.",
 )
 
 PAGES = {

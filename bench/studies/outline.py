@@ -10,9 +10,12 @@ NOTES = (
     "The area error sums the differences between the fractions of pixels that the fitted and the true mesh cover, each "
     "by 8 x 8 rays. At the start, the mean shape has an error of {start:.3g} pixels (median).",
     "Rows named `area` compare a pixel's mean opacity with the fraction that the shape covers. The other rows compare "
-    "single rays: in a pixel of which a fraction k of n rays is covered, the k rays nearest to the surface should hit.",
+    "single rays: in a pixel of which a fraction k of n rays is covered, k rays should hit. These are first rays that "
+    "hit, in random order, and then the rays nearest to the surface.",
     "With 1 ray, it goes through the centre of each pixel. With 4 and 16, each iteration draws a random ray in each of "
-    "2 x 2 or 4 x 4 squares of the pixel.",
+    "2 x 2 or 4 x 4 squares of the pixel. All rows have 60 iterations, so four times the rays cost four times as much.",
+    "With 1 ray, a pixel's observation is its mask at the centre. With several, it is the covered fraction. Rows named "
+    "`mask` have the mask for any number of rays, and rows named `fraction` the fraction.",
 )
 
 
@@ -26,6 +29,7 @@ PAGES = {
         condition=RAYS,
         heading="Rays per pixel",
         first=1,
+        absent=1,
         compared=4,
         measures=(
             condition_curves.Measure("area_error", "Area error (pixels)"),

@@ -14,7 +14,7 @@ from bench.solve.observed_view import DEPTH_LOSSES, ObservedView
 from bench.solve.optimise import HELD_OUT, OptimiserSettings, StartSettings, with_affordable_rays
 from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import check_field_gradient, save_in_world, solve_task
-from datasets.scene import OneView, Scene, unshaded_image
+from datasets.scene import OneView, Scanned, Scene, unshaded_image
 from datasets.views import observed_pixels, parse_amount
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.rendering import Renderer
@@ -72,6 +72,7 @@ class Completion:
     takes_one_view: ClassVar[bool] = True
     takes_rays_per_pixel: ClassVar[bool] = True
     problem_class: ClassVar[type[CodeProblem]] = CodeProblem
+    fractions: ClassVar[bool | None] = None
 
     def __post_init__(self) -> None:
         parse_amount(self.points)
@@ -95,6 +96,10 @@ class Completion:
             raise BadInput(
                 "several rays per pixel compare depths and masks of a true mesh by field=prior: remove "
                 "view.rays_per_pixel, or set task.normal_weight=0 task.colour_weight=0 field=prior"
+            )
+        if inputs.views.rays_per_pixel > 1 and isinstance(inputs.dataset, Scanned) and self.depths == MEASURED:
+            raise BadInput(
+                "a scanner measures no area of a pixel: remove view.rays_per_pixel, or set task.depths=exact"
             )
         if self.colour_weight and not (inputs.prior_choice.coloured and inputs.field.of_prior):
             raise BadInput("task.colour_weight needs codes of shape and colour: set prior=textured field=prior")
@@ -156,4 +161,4 @@ class Completion:
         if self.colour_weight:
             image = unshaded_image(view, scene.texture).where(view.mask[..., None], torch.nan)
             observed_view = replace(observed_view, colours=image.to(device), colour_weight=self.colour_weight)
-        return observed_view.with_area(scene, view.camera, scene.seed(seed))
+        return observed_view.with_area(scene, view.camera, scene.seed(seed), self.fractions)

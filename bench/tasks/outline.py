@@ -44,7 +44,13 @@ class OutlineProblem(CodeProblem):
 
 @dataclass(frozen=True)
 class Outline(Completion):
-    """Completion with the metric `area_error`, and a picture of it; its YAML gives the mask alone."""
+    """Completion with the metric `area_error`, and a picture of it; its YAML gives the mask alone.
+
+    Args:
+        fractions: see `bench.solve.observed_view.ObservedView.with_area`.
+    """
+
+    fractions: bool | None = None
 
     problem_class: ClassVar[type[CodeProblem]] = OutlineProblem
 

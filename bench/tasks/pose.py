@@ -270,7 +270,8 @@ class PoseProblem:
     def _compare(self, shape: Field, step: int, start: int, pixels: Tensor | None = None) -> dict[str, Tensor]:
         """The weighted terms of a start at the pixels [n] of an image by rows, or at all, and their sum."""
         camera = self.cameras[start].with_object_moved(self.parameters[start])
-        renderer, rays = at_iteration(self.renderer, step), random_rays(camera, self.rays_per_pixel, self.seed, step)
+        renderer, count = at_iteration(self.renderer, step), self.rays_per_pixel
+        rays = camera.rays() if self.area is None else random_rays(camera, count, self.seed, step)
         observations = self.depth, self.depth_per_distance, self.observed, self.normals, self.covered
         if pixels is not None:
             pixels = pixels.to(self.device)

@@ -18,6 +18,7 @@ from renderers.tracing.bracket import equally_spaced
 # Standard deviations. A smaller change between two samples is rounding: the rate at their mean value replaces it.
 MIN_CHANGE = 1e-2
 MAX_CLEARANCE = 8.0  # standard deviations from the mean surface: the density beyond is 1e-14, and is not evaluated
+MIN_DEVIATIONS = -1e3  # below, the derivatives of log_ndtr are wrong in float32
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class Opaque(VolumeRenderer):
         one attenuates by half of the mean rate, which is that change per change of the value, times the length.
         """
         deviations = self.sharpness * value
-        log_free = log_ndtr(deviations)
+        log_free = log_ndtr(deviations.clamp_min(MIN_DEVIATIONS))
         change, first, second = log_free[:, 1:] - log_free[:, :-1], deviations[:, :-1], deviations[:, 1:]
         is_steep = (second - first).abs() > MIN_CHANGE
         steepness = torch.where(is_steep, second - first, 1.0)

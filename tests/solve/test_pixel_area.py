@@ -63,6 +63,19 @@ def test_a_mask_of_single_rays_changes_as_few_rays_as_the_fraction_allows():
     assert (nearest <= torch.where(left, rendering.closest, torch.inf).amin(-1)).all()
 
 
+def test_surplus_hits_are_taken_from_all_parts_of_a_pixel():
+    rays = random_rays(CAMERA, 16, 0, 0)
+    rendering = load("renderer", "dist").render(sphere(RADIUS), rays)
+    torch.manual_seed(0)
+    fewer = (rendering.hit.float().mean(-1) - 4 / 16).clamp_min(0)
+    mask = observation_of(fewer, torch.zeros(24, 24), rendering).mask
+    assert torch.equal(mask.sum(-1), (fewer * 16).round().long())
+    assert not bool((mask & ~rendering.hit).any())
+    taken = (rendering.hit & ~mask).view(24, 24, 4, 4).sum((0, 1))  # of the columns, then the rows of a pixel
+    assert taken.sum(0).float().std() < 0.2 * taken.sum(0).float().mean()
+    assert taken.sum(1).float().std() < 0.2 * taken.sum(1).float().mean()
+
+
 @each("name", ["relaxed_boundary", "neus"])
 def test_the_gradient_of_the_area_is_that_of_the_outline_with_16_rays(name):
     renderer = load("renderer", name).with_blur(0.02)
@@ -78,7 +91,7 @@ def test_the_gradient_of_the_area_is_that_of_the_outline_with_16_rays(name):
 
 def test_with_a_ray_per_pixel_the_band_is_mostly_missed_and_the_area_has_no_gradient():
     radius = torch.tensor(RADIUS, requires_grad=True)
-    opacity = load("renderer", "relaxed_boundary").render(sphere(radius), random_rays(CAMERA, 1, 0, 0)).opacity
+    opacity = load("renderer", "relaxed_boundary").render(sphere(radius), CAMERA.rays()).opacity
     expected = (true_area(RADIUS + 1e-3) - true_area(RADIUS - 1e-3)) / 2e-3
     assert abs(torch.autograd.grad(opacity.sum(), radius)[0].item()) < 0.1 * expected
 

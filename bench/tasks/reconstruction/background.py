@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from renderers.camera import Rays, distance_to_origin
+from renderers.camera import Rays
 from renderers.fields.networks.coloured import positional_encoding
 
 NONE, SPHERE = "none", "sphere"
@@ -55,12 +55,13 @@ class OutsideSphere(nn.Module):
         self.network = nn.Sequential(*layers, nn.Linear(NETWORK_WIDTH, 4))
 
     def forward(self, rays: Rays) -> Float[Tensor, "n 3"]:
-        nearest = distance_to_origin(rays)
         approach = -(rays.origins * rays.directions).sum(-1)
+        nearest = torch.linalg.vector_norm(rays.at(approach), dim=-1)
         share = (torch.arange(SAMPLES_PER_RAY, dtype=nearest.dtype, device=nearest.device) + 0.5) / SAMPLES_PER_RAY
         inverse_radius = (1 - share) / nearest.clamp_min(1.0)[:, None]
         half_chord = (inverse_radius.pow(-2) - nearest.square()[:, None]).clamp_min(1e-6).sqrt()
-        directions = rays.at_each(approach[:, None] + half_chord) * inverse_radius[..., None]
+        distances = (approach[:, None] + half_chord).clamp_min(0.0)  # of a ray that looks away: its origin
+        directions = torch.nn.functional.normalize(rays.at_each(distances), dim=-1)
         encoded = positional_encoding(
             torch.cat([directions, inverse_radius[..., None]], dim=-1) * pi / 2, NETWORK_OCTAVES
         )

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from typing import ClassVar
+from zlib import crc32
 
 import torch
 
@@ -79,6 +80,10 @@ class Reconstruction(PhotographTask):
         check_at_least("task.rays", self.rays, 4, "1024 work")
         check_choice("task.cameras", self.cameras, cameras.CHOICES)
         check_choice("task.background", self.background, behind.CHOICES)
+        if self.losses.normals and (self.camera_noise or self.cameras == cameras.REFINE):
+            raise ValueError(
+                "given normals are in world axes, which wrong cameras do not know: set task.losses.normals=0"
+            )
         if self.background != behind.NONE and self.masks:
             raise ValueError(
                 f"task.background={self.background} is for photographs without masks: set task.masks=false"
@@ -105,7 +110,8 @@ class Reconstruction(PhotographTask):
         )
         run.record.definitions = dict(definitions)
         subject = self.subject(inputs)
-        warnings = [UNMASKED_WARNING] if subject.input_shots[0].mask is None else []
+        unmasked = subject.input_shots[0].mask is None and self.background == behind.NONE
+        warnings = [UNMASKED_WARNING] if unmasked else []
         run.record.notes = [*run.record.notes, subject.summary, *warnings]
         if name != AUTO:
             solve_and_draw(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
@@ -130,7 +136,7 @@ class Reconstruction(PhotographTask):
         inputs = run.inputs
         model = self.appearance.make(name).to(inputs.device)
         true = None if self.camera_noise is None else [shot.camera for shot in subject.input_shots]
-        shots = cameras.disturbed(subject.input_shots, self.camera_noise or 0, inputs.seed)
+        shots = cameras.disturbed(subject.input_shots, self.camera_noise or 0, crc32(inputs.scene_name.encode()))
         guide = {GIVEN: given_distances, HULL: hull_distances}.get(self.guide)
         stack = Stack.build(shots, guide and guide(shots), inputs.device)
         iterations = self.optimiser.iterations
