@@ -1,20 +1,24 @@
 """Several rays per pixel: where they lie, what is observed of a pixel, and the gradient of the covered area."""
 
+from dataclasses import replace
 from math import pi, sqrt
+from types import SimpleNamespace
 
 import pytest
 import torch
 import trimesh
 
 from bench.config import load
+from bench.solve.observed_view import ObservedView
 from bench.solve.pixel_area import mean_depth, observation_of, random_rays
+from bench.solve.pixel_draw import PixelDraw
 from datasets.mesh import Mesh
 from datasets.scene import Truth, see_area
 from renderers.fields.analytic import sphere
 from renderers.rendering import RayObservation, Unsupported
 from renderers.silhouette import Area
 from tests.looped import each
-from tests.tiny import camera_of
+from tests.tiny import CPU, camera_of, icosphere, scene_of
 
 RADIUS = 0.5
 CAMERA = camera_of(24, field_of_view=40.0)
@@ -120,3 +124,36 @@ def test_a_pixels_depth_is_the_mean_of_its_hits():
     expected = CAMERA.project(rendering.points[tuple(pixel)])[1][rendering.hit[tuple(pixel)]].mean()
     assert float(depth[tuple(pixel)]) == pytest.approx(float(expected), rel=1e-5)
     assert torch.equal(hit, rendering.hit.any(-1))
+
+
+@each("silhouette", ["area", "hinge", "own"])
+def test_a_view_of_several_rays_compares_areas_and_has_no_loss_at_the_truth(silhouette):
+    loss = load("silhouette", silhouette)
+    scene = replace(scene_of(icosphere(RADIUS), CAMERA), rays_per_pixel=16)
+    settings = SimpleNamespace(depth_loss="depth", depth_weight=1.0, silhouette=loss, silhouette_weight=1.0)
+    name = "relaxed_boundary"
+    view = ObservedView.of(
+        scene.view, settings, load("renderer", name), observed=scene.view.mask, mask=scene.view.mask, device=CPU
+    ).with_area(scene, CAMERA, 0)
+    assert torch.equal(view.covered, see_area(scene.raycaster, CAMERA)[0])
+    draw = PixelDraw(scene.view.mask, 2, 0)
+    compared = {}
+    for radius in (RADIUS, 0.8 * RADIUS):
+        field = sphere(torch.tensor(radius, requires_grad=True))
+        compared[radius] = view.compare_drawn(draw, field, 1)
+        assert compared[radius]["silhouette"].isfinite()
+    true, wrong = compared[RADIUS], compared[0.8 * RADIUS]
+    assert true["depth"].item() < 0.1 * wrong["depth"].item()
+    assert true["silhouette"].item() < 0.3 * wrong["silhouette"].item()
+
+
+def test_fractions_are_an_option_of_one_and_of_several_rays():
+    scene = scene_of(icosphere(RADIUS), CAMERA)
+    settings = SimpleNamespace()
+    base = ObservedView.of(
+        scene.view, settings, load("renderer", "dist"), observed=scene.view.mask, mask=scene.view.mask, device=CPU
+    )
+    assert base.with_area(scene, CAMERA, 0) is base
+    assert base.with_area(scene, CAMERA, 0, fractions=True).rays.shape == (24, 24, 1)
+    several = base.with_area(replace(scene, rays_per_pixel=4), CAMERA, 0, fractions=False)
+    assert several.rays.shape == (24, 24, 4) and torch.equal(several.covered, scene.view.mask.float())
