@@ -15,8 +15,6 @@ from bench.report.write.result import Result
 from bench.report.write.table import Column, ends, text
 
 SHAPE = ["family", "solid", "seed"]
-UNCHANGED = " (not significant)"
-VERDICTS = {statistics.Verdict.DIFFERS: "", statistics.Verdict.NOT_DECIDABLE: " (undecided)"}
 NOTE = (
     "Values are medians over shapes, with intervals of the sign test. A ratio compares the same shapes. The verdict's "
     "significance is by the sign test with Holm's correction over all its ratios."
@@ -136,13 +134,16 @@ class ConditionCurves:
         return {name: gain for name, gain in gains.items() if gain is not None}
 
     def _verdict(self, ratios: dict[str, statistics.Interval]) -> str:
-        """The ratios, and whether each is significant."""
-        verdicts = statistics.ratio_verdicts([*ratios.values()])
-        parts = [
-            f"{name} *{format.number(ratio.value)}*{VERDICTS.get(verdict, UNCHANGED)}"
-            for (name, ratio), verdict in zip(ratios.items(), verdicts, strict=True)
-        ]
-        return f"{self.verdict}: {'; '.join(parts)}." if parts else ""
+        """The significant ratios, and the number of others."""
+        verdicts = dict(zip(ratios, statistics.ratio_verdicts([*ratios.values()]), strict=True))
+        differ = [name for name, verdict in verdicts.items() if verdict is statistics.Verdict.DIFFERS]
+        parts = [f"{name} *{format.number(ratios[name].value)}*" for name in differ]
+        if len(differ) < len(ratios):
+            undecided = statistics.Verdict.NOT_DECIDABLE in verdicts.values()
+            reason = "too few shapes" if undecided else "no significant difference from 1"
+            parts.append(f"{format.plural(len(ratios) - len(differ), 'other row')}: {reason}")
+        shapes = sorted({len(ratio.points) for ratio in ratios.values()})
+        return f"{self.verdict}: {'; '.join(parts)}; n = {' or '.join(map(str, shapes))} shapes." if ratios else ""
 
     def _panel(self, lines: list[Line], measure: Measure) -> chart.Panel:
         rows: dict[tuple[str, str], list[Line]] = {}
