@@ -1,7 +1,8 @@
 """Positions of cameras, and the choice of pixels whose depth is observed."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import asin, atan2, degrees, inf, isqrt, nan, radians, tan
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,6 +50,11 @@ class ViewSampler:
         check_elevation("elevation", self.elevation)
         if self.rays_per_pixel < 1 or isqrt(self.rays_per_pixel) ** 2 != self.rays_per_pixel:
             raise ValueError(f"view.rays_per_pixel must be 1, 4, 9, 16, ..., not {self.rays_per_pixel}")
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The settings on which images depend, as plain data."""
+        return {name: value for name, value in asdict(self).items() if name != "rays_per_pixel"}
 
     @property
     def focal_length(self) -> float:

@@ -90,7 +90,7 @@ class ConditionCurves:
         return (
             *(text("name", "Method"), Column("value", self.heading), Column("shapes", "Shapes")),
             *(Column(first.key, first.heading), *ends(first.key, lambda line: line["estimates"][first.key])),
-            *(Column("ratio", f"Ratio to {self.first:g}"), *ends("ratio", lambda line: line["gain"])),
+            *(Column("ratio", f"Ratio to that at {self.first:g}"), *ends("ratio", lambda line: line["gain"])),
             *(Column(each.key, each.heading) for each in self.measures[1:]),
             Column("cost", "Field evaluations"),
         )
@@ -104,7 +104,7 @@ class ConditionCurves:
                 gain = None if value == self.first else self._gain(group, groups.get(self.first))
                 lines.append(
                     {
-                        **{"name": name, "preset": preset, "value": value, "shapes": len(group)},
+                        **{"name": name, "preset": preset, "value": _whole(value), "shapes": len(group)},
                         **{key: estimate.value for key, estimate in estimates.items()},
                         **{"estimates": estimates, "ratio": gain and gain.value, "gain": gain},
                         "cost": format.number(group.cost.median()),
@@ -154,6 +154,10 @@ class ConditionCurves:
             for row, points in rows.items()
         ]
         return chart.panel_data("", self.heading.lower(), measure.heading, curves)
+
+
+def _whole(value: float) -> float | int:
+    return int(value) if value == int(value) else value
 
 
 def _shapes(values: pd.Series) -> list[np.ndarray]:

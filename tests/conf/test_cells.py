@@ -118,6 +118,8 @@ def brings_its_own(cell: list[str], config: DictConfig, key: str, value: str) ->
     overrides = [f"{size}={iterations}"] if iterations != OmegaConf.select(default, size) else []
     if "fit" in config.task:  # a stress
         overrides += [f"task.optimiser.iterations={config.task.fit.iterations}"]
+    elif key == "method" and "iterations" not in str(choice("method", value)):  # so the experiment may set them
+        overrides += [f"task.optimiser.iterations={iterations}" for iterations in _iterations(config)]
     draw = [text for text in cell if text.startswith("draw=")]
     alone = composed(f"{'+' if key == 'method' else ''}{key}={value}", "scale=smoke", *draw, *overrides)
     assert config.label == alone.label
@@ -126,6 +128,12 @@ def brings_its_own(cell: list[str], config: DictConfig, key: str, value: str) ->
         assert config.task._target_ == alone.task._target_
         view_settings = choice("method", value).get("view")
         assert view_settings is None or config.view.resolution == alone.view.resolution
+
+
+def _iterations(config: DictConfig) -> list[int]:
+    """The iterations of a task, if it optimises."""
+    optimiser = config.task.get("optimiser")
+    return [] if optimiser is None else [optimiser.iterations]
 
 
 @each("name", [*COMPARING])

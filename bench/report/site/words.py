@@ -10,6 +10,8 @@ from bench.report.data.records import Record, iterations_of, setting
 
 TASKS = {
     "completion": "Complete a shape from sparse depth and its mask",
+    "outline": "Find a shape by its mask in one view",
+    "external": "Reconstruct by a code of others, and judge its mesh",
     "multiview": "Find a shape by photographs from known cameras, without a mask",
     "reconstruction": "Find shape and colour from photographs with cameras, without a prior",
     "hull": "Carve the visual hull of the masks, without a renderer",

@@ -59,7 +59,7 @@ class EncoderSettings:
             photography: settings of these photographs and of the training photographs.
         """
         inputs, prior = run.inputs, Prior(deepcopy(run.inputs.prior.decoder).cpu(), run.inputs.prior.codes)
-        settings = {"encoder": asdict(self), "photographs": asdict(photography), "view": asdict(inputs.views)}
+        settings = {"encoder": asdict(self), "photographs": asdict(photography), "view": inputs.views.identity}
         key = digest({"version": VERSION, "prior": fingerprint(prior), **settings})
         with torch.random.fork_rng(), torch.device("cpu"):
             torch.manual_seed(0)

@@ -153,7 +153,7 @@ class Imaging:
     def images(self, dataset: Dataset, split: Split, count: int, cache: Path, progress: Report) -> list[ShapeImages]:
         """The images of the first `count` shapes of a split, from `cache` if it has them."""
         settings = {"dataset": dataset.identity(), "split": split, "count": count, "version": VERSION}
-        key = digest({**settings, "photography": asdict(self.photography), "sampler": asdict(self.sampler)})
+        key = digest({**settings, "photography": asdict(self.photography), "sampler": self.sampler.identity})
 
         def make() -> dict[str, Tensor]:
             images = []

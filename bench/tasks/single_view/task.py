@@ -1,6 +1,6 @@
 """Shape and colour from one image, by a network trained on many shapes (DVR, Sec. 4.1)."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +122,7 @@ class OneImage:
         """The recipe that determines the network of a run's configuration."""
         check_field_gradient(inputs.renderer)
         sampler = replace(inputs.views, resolution=self.image_pixels, elevation=self.elevation)
-        settings = {name: config["task"][name] for name in NETWORK_SETTINGS} | {"view": asdict(sampler)}
+        settings = {name: config["task"][name] for name in NETWORK_SETTINGS} | {"view": sampler.identity}
         defaults = {"keep_every": config["task"]["training"]["keep_every"], "schedule": "cosine"}  # not in old hashes
         settings["training"] = {name: x for name, x in settings["training"].items() if defaults.get(name) != x}
         if self.supervision.renders:
