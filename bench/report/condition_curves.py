@@ -48,6 +48,7 @@ class ConditionCurves:
         absent: the value of the condition in runs without the key.
         reference: preset of the row with which the verdict compares the others at `compared`; empty: each row is
             compared with itself at `first`.
+        only_in_table: presets that the figure leaves out.
     """
 
     condition: str
@@ -61,6 +62,7 @@ class ConditionCurves:
     notes: Callable[[Runs], list[str]]
     absent: float = 0.0
     reference: str = ""
+    only_in_table: tuple[str, ...] = ()
 
     def __call__(self, runs: Runs) -> Result:
         """A line per row and value of the condition, over all shapes."""
@@ -148,7 +150,8 @@ class ConditionCurves:
     def _panel(self, lines: list[Line], measure: Measure) -> chart.Panel:
         rows: dict[tuple[str, str], list[Line]] = {}
         for line in lines:
-            rows.setdefault((line["name"], line["preset"]), []).append(line)
+            if line["preset"] not in self.only_in_table:
+                rows.setdefault((line["name"], line["preset"]), []).append(line)
         curves = [
             chart.curve(*row, [line["value"] for line in points], [line["estimates"][measure.key] for line in points])
             for row, points in rows.items()
