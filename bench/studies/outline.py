@@ -11,8 +11,8 @@ NOTES = (
     "The area error sums the differences between the fractions of pixels that the fitted and the true mesh cover, each "
     "by 8 x 8 rays. At the start, the mean shape has an error of {start:.3g} pixels (median).",
     "Rows with area in their name compare a pixel's mean opacity with the fraction that the shape covers. The others "
-    "compare single rays: in a pixel of which a fraction k of n rays is covered, k rays should hit. First rays that hit "
-    "count, in random order, and then the rays nearest to the surface.",
+    "compare single rays: in a pixel of which a fraction k of n rays is covered, k rays should hit. Rays that hit come "
+    "first, in random order, and then the rays nearest to the surface.",
     "With 1 ray, it goes through the centre of each pixel. With 4 and 16, each iteration draws a random ray in each of "
     "2 x 2 or 4 x 4 squares of the pixel. All rows have 60 iterations, so four times the rays cost four times as much.",
     "With 1 ray, a pixel's observation is its mask at the centre. With several, it is the covered fraction. Rows with "
