@@ -1,6 +1,6 @@
 """Objects as volumes: attenuation by an opaque solid with a random surface (Miller et al., CVPR 2024)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import pi
 
 import torch
@@ -8,12 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.special import erfcx, log_ndtr
 
-from renderers.camera import Rays
-from renderers.checks import check_at_least, check_positive
-from renderers.field import Field
-from renderers.later.volumes import Samples, VolumeRenderer, render_volume, resample, schedule, weights
-from renderers.rendering import Rendering, check_kind
-from renderers.tracing.bracket import equally_spaced
+from renderers.later.volumes import SharpenedVolume
 
 # Standard deviations. A smaller change between two samples is rounding: the rate at their mean value replaces it.
 MIN_CHANGE = 1e-2
@@ -22,7 +17,7 @@ MIN_DEVIATIONS = -1e3  # below, the derivatives of log_ndtr are wrong in float32
 
 
 @dataclass(frozen=True)
-class Opaque(VolumeRenderer):
+class Opaque(SharpenedVolume):
     """Attenuation by a solid whose surface has a Gaussian distance from the field's, and a distribution of normals.
 
     The attenuation is a product. Its first factor is the density of the surface divided by the probability of free
@@ -39,60 +34,18 @@ class Opaque(VolumeRenderer):
         at midpoints of equal fractions and are not random; the background is empty.
 
     Args:
-        samples: equally spaced from the ray's entry into the sphere to its exit, both included.
-        rounds: of further samples by importance.
-        round_samples: in each round.
-        round_sharpness: sharpness in the first round, per scene unit; it doubles with each round.
+        samples, rounds, round_samples, round_sharpness, first_sharpness: see `volumes.SharpenedVolume`.
         sharpness: inverse of the standard deviation of the surface, per scene unit.
-        first_sharpness: at the first iteration of an optimisation.
         anisotropy: weight of the delta distribution: 1 has the field's normals only, 0 has all normals equally.
         sharpening, mask_weight, sphere_radius: see `integrate.VolumeRenderer`.
     """
 
-    samples: int
-    rounds: int
-    round_samples: int
-    round_sharpness: float
-    sharpness: float
-    first_sharpness: float
     anisotropy: float
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least("samples", self.samples, 2, "the official code uses 64")
-        check_at_least("rounds", self.rounds, 0, "the official code of NeuS uses 4")
-        check_at_least("round_samples", self.round_samples, 1, "the official code of NeuS uses 16")
-        for name in ("round_sharpness", "sharpness", "first_sharpness"):
-            check_positive(name, getattr(self, name), "conf/renderer/opaque.yaml has values that work")
         if not 0 <= self.anisotropy <= 1:
             raise ValueError(f"anisotropy must lie between 0 (uniform) and 1 (delta), not {self.anisotropy}")
-
-    @property
-    def blur(self) -> float:
-        """The standard deviation of the surface, in scene units."""
-        return 1 / self.sharpness
-
-    def with_blur(self, blur: float) -> "Opaque":
-        return replace(self, sharpness=1 / blur, sharpening=0)
-
-    def at_iteration(self, iteration: int) -> "Opaque":
-        """The renderer at an iteration, with a sharpness between `first_sharpness` and `sharpness`."""
-        return replace(self, sharpness=schedule(self.first_sharpness, self.sharpness, self.sharpening, iteration))
-
-    def render(self, field: Field, rays: Rays) -> Rendering:
-        """Samples where the solid absorbs light, then sums with a graph."""
-        check_kind(self, field)
-        return render_volume(field, rays, self._search, self._log_transmittance, radius=self.sphere_radius)
-
-    def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
-        """Equally spaced samples, then rounds of further ones where the weight is largest."""
-        samples = Samples.of(field, rays, equally_spaced(entry, leave, self.samples))
-        for index in range(self.rounds):
-            sharper = replace(self, sharpness=self.round_sharpness * 2**index)
-            importance = weights(sharper._log_transmittance(samples.value, samples.distance))
-            distance = resample(samples.distance, importance, self.round_samples)
-            samples = samples.merge(Samples.of(field, rays, distance))
-        return samples
 
     def _log_transmittance(
         self, value: Float[Tensor, "n samples"], distance: Float[Tensor, "n samples"]

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import log
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,9 +14,18 @@ from renderers.camera import Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Field, carries_gradient
 from renderers.gradients import reevaluate_with_graph
-from renderers.rendering import DISTANCE_CAPABILITIES, Capabilities, Deferred, Rendering, Status, Volume, assemble
+from renderers.rendering import (
+    DISTANCE_CAPABILITIES,
+    Capabilities,
+    Deferred,
+    Rendering,
+    Status,
+    Volume,
+    assemble,
+    check_kind,
+)
 from renderers.schedule import schedule_position
-from renderers.tracing.bracket import SAMPLES_PER_BATCH
+from renderers.tracing.bracket import SAMPLES_PER_BATCH, equally_spaced
 
 MIN_LIGHT = 1e-5  # samples that absorb less of a ray's light have neither a weight nor a gradient
 HIT_OPACITY = 0.5  # a ray with a larger opacity is a hit
@@ -169,6 +178,70 @@ class VolumeRenderer(ABC):
         opacity = rendering.opacity.clamp(MIN_LOSS_OPACITY, 1 - MIN_LOSS_OPACITY)
         entropy = -torch.where(mask, opacity, 1 - opacity).log().sum() / max(mask.numel(), 1)
         return self.mask_weight * entropy
+
+
+@dataclass(frozen=True)
+class SharpenedVolume(VolumeRenderer):
+    """A volume of one sharpness, whose samples lie where the weights of sharper and sharper volumes are large.
+
+    Args:
+        samples: equally spaced from the ray's entry into the sphere to its exit, both included.
+        rounds: of further samples by importance.
+        round_samples: in each round.
+        round_sharpness: sharpness in the first round, per scene unit; it doubles with each round.
+        sharpness: inverse of the blur of the surface, per scene unit.
+        first_sharpness: at the first iteration of an optimisation.
+        sharpening, mask_weight, sphere_radius: see `VolumeRenderer`.
+    """
+
+    samples: int
+    rounds: int
+    round_samples: int
+    round_sharpness: float
+    sharpness: float
+    first_sharpness: float
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least("samples", self.samples, 2, "the paper of NeuS uses 64")
+        check_at_least("rounds", self.rounds, 0, "the official code of NeuS uses 4")
+        check_at_least("round_samples", self.round_samples, 1, "the official code of NeuS uses 16")
+        check_positive("round_sharpness", self.round_sharpness, "the official code of NeuS begins at 64")
+        check_positive("sharpness", self.sharpness, "1000 blurs the surface over .004 of the unit sphere")
+        check_positive("first_sharpness", self.first_sharpness, "the official code of NeuS begins at 20")
+
+    @property
+    def blur(self) -> float:
+        """The inverse of the sharpness, in scene units."""
+        return 1 / self.sharpness
+
+    def with_blur(self, blur: float) -> Self:
+        return replace(self, sharpness=1 / blur, sharpening=0)
+
+    def at_iteration(self, iteration: int) -> Self:
+        """The renderer at an iteration, with a sharpness between `first_sharpness` and `sharpness`."""
+        return replace(self, sharpness=schedule(self.first_sharpness, self.sharpness, self.sharpening, iteration))
+
+    def render(self, field: Field, rays: Rays) -> Rendering:
+        """Samples where the weights are large, then sums with a graph."""
+        check_kind(self, field)
+        return render_volume(field, rays, self._search, self._log_transmittance, radius=self.sphere_radius)
+
+    @abstractmethod
+    def _log_transmittance(
+        self, value: Float[Tensor, "n samples"], distance: Float[Tensor, "n samples"]
+    ) -> Float[Tensor, "n intervals"]:
+        """The logarithm of the fraction of light that passes each interval between samples."""
+
+    def _search(self, field: Field, rays: Rays, entry: Tensor, leave: Tensor) -> Samples:
+        """Equally spaced samples, then rounds of further ones where the weight is largest."""
+        samples = Samples.of(field, rays, equally_spaced(entry, leave, self.samples))
+        for index in range(self.rounds):
+            sharper = replace(self, sharpness=self.round_sharpness * 2**index)
+            importance = weights(sharper._log_transmittance(samples.value, samples.distance))
+            distance = resample(samples.distance, importance, self.round_samples)
+            samples = samples.merge(Samples.of(field, rays, distance))
+        return samples
 
 
 @dataclass(frozen=True)
