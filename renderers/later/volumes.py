@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import log
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -215,10 +215,10 @@ class SharpenedVolume(VolumeRenderer):
         """The inverse of the sharpness, in scene units."""
         return 1 / self.sharpness
 
-    def with_blur(self, blur: float) -> Self:
+    def with_blur(self, blur: float) -> "SharpenedVolume":
         return replace(self, sharpness=1 / blur, sharpening=0)
 
-    def at_iteration(self, iteration: int) -> Self:
+    def at_iteration(self, iteration: int) -> "SharpenedVolume":
         """The renderer at an iteration, with a sharpness between `first_sharpness` and `sharpness`."""
         return replace(self, sharpness=schedule(self.first_sharpness, self.sharpness, self.sharpening, iteration))
 

@@ -149,7 +149,7 @@ def test_a_view_of_several_rays_compares_areas_and_has_no_loss_at_the_truth(silh
 
 def test_fractions_are_an_option_of_one_and_of_several_rays():
     scene = scene_of(icosphere(RADIUS), CAMERA)
-    settings = SimpleNamespace()
+    settings = SimpleNamespace(depth_loss="depth", depth_weight=1.0, silhouette=None, silhouette_weight=0.0)
     base = ObservedView.of(
         scene.view, settings, load("renderer", "dist"), observed=scene.view.mask, mask=scene.view.mask, device=CPU
     )
