@@ -20,13 +20,14 @@ from bench.external import find_recipe, main, read_recipe
 from bench.records.record import Record, read_record
 from bench.setup.inputs import RunContext, prepare_run
 from bench.tables import CONF
+from bench.tasks.reconstruction.cameras import CameraMotions
 from datasets.files.captures.exports import LAYOUTS, write_idr, write_pmo
 from datasets.files.meshes import read_mesh
 from datasets.files.own_photographs import Capture, read_capture
 from tests.composing import identified
 from tests.made_photographs import CENTRE, PLAIN, RADIUS, READ, idr
 from tests.runner.driving import by_program, command
-from tests.tiny import icosphere
+from tests.tiny import CPU, icosphere
 
 GROWN = 1.2  # the code's sphere is larger than the true one by this factor
 TO_SPHERE = [[0, 0, 2.0, 0.1], [2.0, 0, 0, -0.2], [0, 2.0, 0, 0.3], [0, 0, 0, 1]]  # turned, scaled and shifted
@@ -268,6 +269,19 @@ def test_a_written_layout_is_read_as_the_same_photographs(capture, tmp_path, lay
     if layout == "dvr":  # the corners of DVR's cube are within one scene unit of its faces
         with np.load(tmp_path / "cameras.npz") as cameras:
             assert np.array_equal(cameras["scale_mat_0"], np.diag([2.0, 2.0, 2.0, 1.0]))
+
+
+def test_learnt_cameras_are_read_as_the_same_photographs(capture, tmp_path):
+    write_idr(capture.shots, tmp_path, 0.0)
+    (tmp_path / "cameras_sphere.npz").unlink()
+    named = [replace(shot, name=f"image/{index:06d}.png") for index, shot in enumerate(capture.shots)]
+    CameraMotions(named, None, True, CPU).save(tmp_path / "transforms.json", capture.to_world)
+    result = read_capture(tmp_path, READ)
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.3, -0.2, 0.1]])
+    pairs = zip(capture.shots, result.shots, strict=True)
+    to_read = torch.from_numpy(np.linalg.inv(result.to_world) @ capture.to_world).float()
+    moved = points @ to_read[:3, :3].T + to_read[:3, 3]
+    assert all(torch.allclose(b.camera.project(moved)[0], a.camera.project(points)[0], atol=1e-3) for a, b in pairs)
 
 
 def test_the_centre_of_the_first_pixel_moves_the_cameras(capture, tmp_path):

@@ -1,5 +1,6 @@
 """Reconstruction from photographs on disk and of a mesh: it improves, leaves a coloured mesh, and tells mistakes."""
 
+import json
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -275,6 +276,12 @@ def test_learnt_cameras_move_and_kept_ones_stay(tmp_path, scene):
     assert learnt.metrics_start["camera_error_deg"] == pytest.approx(6, rel=1e-3)
     assert abs(learnt.metrics["camera_error_deg"] - 6) > 0.01
     assert "camera_error_deg" in learnt.definitions
+    (frames,) = (json.loads(file.read_text())["frames"] for file in tmp_path.rglob("transforms.json"))
+    shots = SETTINGS.subject(run_in(tmp_path, scene).inputs).input_shots
+    true = torch.stack([shot.camera.camera_to_world[:3, :3] for shot in shots])
+    written = torch.tensor([frame["transform_matrix"] for frame in frames])[:, :3, :3] * torch.tensor([1.0, -1, -1])
+    cosine = ((written @ true.mT)[1:].diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2
+    assert cosine.acos().rad2deg().mean().item() == pytest.approx(learnt.metrics["camera_error_deg"], rel=1e-3)
 
 
 def test_cameras_are_not_learnt_without_a_gradient_towards_rays(tmp_path, scene):

@@ -48,9 +48,9 @@ class OutsideSphere(nn.Module):
         super().__init__()
         layers = [
             nn.Linear(4 + 8 * NETWORK_OCTAVES, NETWORK_WIDTH),
-            nn.Softplus(),
+            nn.ReLU(),
             nn.Linear(NETWORK_WIDTH, NETWORK_WIDTH),
-            nn.Softplus(),
+            nn.ReLU(),
         ]
         self.network = nn.Sequential(*layers, nn.Linear(NETWORK_WIDTH, 4))
 

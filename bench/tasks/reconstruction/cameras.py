@@ -3,13 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import radians
+from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from bench.tasks.pose import pose_error
 from bench.tasks.reconstruction.pixels import Pixels
+from datasets.files.captures.exports import write_transforms
+from datasets.files.captures.sphere import in_world
 from datasets.shot import Shot
 from renderers.camera import Camera, Rays, rigid
 
@@ -66,6 +70,12 @@ class CameraMotions:
     def apply(self, pixels: Pixels) -> Pixels:
         """The pixels with the rays of the moved cameras; gradients flow to the numbers."""
         return replace(pixels, rays=moved(pixels.rays, self.twists, pixels.photograph)) if self.learnt else pixels
+
+    def save(self, path: Path, to_world: Float[np.ndarray, "4 4"] | None) -> None:
+        """Writes the current cameras as NeRF's JSON, in the photographs' world or, for a rendered scene, in its own."""
+        world = np.linalg.inv(np.eye(4) if to_world is None else to_world)
+        shots = [replace(shot, camera=camera) for shot, camera in zip(self.shots, self.cameras, strict=True)]
+        write_transforms([in_world(shot, world) for shot in shots], path)
 
     def errors(self) -> dict[str, float]:
         """The errors of the cameras; empty without true ones."""

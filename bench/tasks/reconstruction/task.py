@@ -32,6 +32,7 @@ from renderers.field import Field
 from renderers.rendering import Unsupported, check_kind
 
 UNMASKED_WARNING = "without masks nothing says where the object ends: expect the shape to keep what is behind it"
+LEARNT_CAMERAS = "transforms.json"
 COUNT_DEFINITIONS = {
     "evaluations": "those of the field, for its surface and its normals; not those of colours, one per hit on the "
     "foreground in each iteration, in a volume one per sample with a weight, nor second derivatives"
@@ -113,19 +114,27 @@ class Reconstruction(PhotographTask):
         unmasked = subject.input_shots[0].mask is None and self.background == behind.NONE
         warnings = [UNMASKED_WARNING] if unmasked else []
         run.record.notes = [*run.record.notes, subject.summary, *warnings]
-        if name != AUTO:
-            solve_and_draw(lambda: self.problem(name, subject, run), self.optimiser, run, definitions)
-            subject.finish(run)
-            return
-        with torch.random.fork_rng():  # the final run is the same as a run of the chosen field alone
-            sizes = {name: sum(tensor.numel() for tensor in model.parameters()) for name, model in models.items()}
-            choice = self.auto.choose(lambda n, s: self.problem(n, s, run), sizes, subject, self.optimiser, run)
-        run.record.notes.append(choice.note)
-        solve_and_draw(lambda: self.problem(choice.kept.candidate, subject, run), self.optimiser, run, definitions)
+        choice = None
+        if name == AUTO:
+            with torch.random.fork_rng():  # the final run is the same as a run of the chosen field alone
+                sizes = {name: sum(tensor.numel() for tensor in model.parameters()) for name, model in models.items()}
+                choice = self.auto.choose(lambda n, s: self.problem(n, s, run), sizes, subject, self.optimiser, run)
+            run.record.notes.append(choice.note)
+            name = choice.kept.candidate
+        problems: list[ReconstructionProblem] = []
+
+        def make() -> ReconstructionProblem:
+            problems.append(self.problem(name, subject, run))
+            return problems[-1]
+
+        solve_and_draw(make, self.optimiser, run, definitions)
         subject.finish(run)
-        seconds = run.record.seconds
-        run.record.metrics |= choice.metrics(seconds["forward"] + seconds["backward"])
-        seconds["trials"] = choice.seconds
+        if self.cameras == cameras.REFINE:
+            problems[-1].motions.save(run.folder / LEARNT_CAMERAS, subject.to_world)
+        if choice is not None:
+            seconds = run.record.seconds
+            run.record.metrics |= choice.metrics(seconds["forward"] + seconds["backward"])
+            seconds["trials"] = choice.seconds
 
     def field_metrics(self, field: Field, run: RunContext) -> dict[str, float]:
         subject = self.subject(run.inputs)

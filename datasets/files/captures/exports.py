@@ -3,6 +3,7 @@
 The world of the written cameras is that of the photographs, whose object lies in the unit sphere.
 """
 
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from datasets.files.captures.frames import OPENGL
 from datasets.shot import Shot
 from renderers.checks import BadInput
 
@@ -69,6 +71,19 @@ def write_pmo(shots: Sequence[Shot], folder: Path, first_pixel: float) -> None:
     (root / "customShapeNet" / folder.name / "ply" / f"{SEQUENCE_NAME}.points.ply").write_text(UNREAD_POINTS)
     extrinsics = np.stack([motion[:3] for _, motion in cameras])
     np.savez(root / "camera.npz", intr=cameras[0][0][:3, :3], extr=extrinsics)
+
+
+def write_transforms(shots: Sequence[Shot], path: Path) -> None:
+    """The cameras alone, as NeRF's JSON.
+
+    Sizes are those that `longest` left, without a lens's distortion, as in the photographs of a run.
+    """
+    frames = []
+    for shot, (intrinsics, motion) in zip(shots, _cameras(shots, PIXEL_CENTRE), strict=True):
+        frame = {"file_path": shot.name, "w": shot.camera.width, "h": shot.camera.height}
+        frame |= {"fl_x": intrinsics[0, 0], "fl_y": intrinsics[1, 1], "cx": intrinsics[0, 2], "cy": intrinsics[1, 2]}
+        frames.append(frame | {"transform_matrix": (np.linalg.inv(motion) @ OPENGL).tolist()})
+    path.write_text(json.dumps({"frames": frames}, indent=1))
 
 
 LAYOUTS: dict[str, Callable[[Sequence[Shot], Path, float], None]] = {
