@@ -313,6 +313,7 @@ def test_a_record_may_name_the_problem_of_a_run(files, capsys):
     assert "in scene units: add --unit-sphere" in refused(capsys, *pair(files, "small"), *more)
 
 
+@pytest.mark.slow
 def test_pictures_of_a_folder_have_the_names_of_the_meshes(files, capsys):
     (files / "found/large.ply").unlink()
     (files / "found/plate.ply").unlink()

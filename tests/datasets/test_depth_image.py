@@ -185,6 +185,7 @@ def test_files_without_depths_are_refused(sofa_files, tmp_path):
             )
 
 
+@pytest.mark.slow
 def test_a_prior_completes_an_object_at_any_pose(sofa_files, tmp_path):
     folder, camera = sofa_files
     rows = str(camera.camera_to_world.tolist()).replace(" ", "")

@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from tests.runner.driving import command, record_of
 
 
+@pytest.mark.slow
 def test_a_command_fits_shape_and_colour_to_one_image(tmp_path):
     small = ("scale=smoke", "isolation=off", "evaluation.grid=24", "evaluation.points=200", "evaluation.gallery=32")
     small += ("evaluation.picture=16", "task.optimiser.iterations=4", "prior.shapes=2", "prior.steps=100", "threads=1")

@@ -192,6 +192,7 @@ def test_without_a_compiler_a_cache_or_the_processor_it_is_torch_and_says_why(mo
     assert fresh(monkeypatch, tmp_path).description == "torch: the processor lacks a-flag-of-none"
 
 
+@pytest.mark.slow
 @with_compiler
 def test_processes_that_build_at_once_share_one_file_and_a_damaged_one_is_built_anew(tmp_path, monkeypatch):
     program = "from renderers.kernels.library import kernels; print(kernels().description)"

@@ -39,6 +39,7 @@ def test_no_value_changes_by_more_than_the_distance_of_the_points(seed, size):
     assert network.kind is Kind.BOUND and network.lipschitz == 1.0
 
 
+@pytest.mark.slow
 @each("seed", SEEDS)
 @each("name", ["naive", "idr", "dist"])
 def test_a_march_with_alpha_1_loses_no_pixel(seed, name):

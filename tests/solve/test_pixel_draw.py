@@ -107,6 +107,7 @@ def test_observations_of_which_no_tenth_can_be_held_out_are_refused():
 SMOKE = ("task=completion", "dataset=sofa", "scale=smoke", "evaluation.grid=16", "evaluation.picture=null")
 
 
+@pytest.mark.slow
 def test_a_completion_with_no_more_effort_than_needed(isolated):
     """Half a pixel, fewer rays, and the same errors before; a typed precision stays."""
     changes = (), ("effort=needed",), ("effort=needed", "renderer.epsilon=1e-5")

@@ -46,6 +46,7 @@ def test_steps_that_cannot_reach_pixel_precision_are_told_before_any_fit(compose
     assert (record.folder / "curve.jsonl").read_text() == ""
 
 
+@pytest.mark.slow
 def test_a_capsule_needs_a_rounded_box(compose_config, tmp_path, capsys):
     ladder = "models.candidates=[sphere,rounded_box]"
     better = ("models.fit.iterations=16", "models.fit.warm_iterations=120")

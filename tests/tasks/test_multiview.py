@@ -138,6 +138,7 @@ def test_random_starts_differ_and_share_the_budget(scene):
     assert kept == int(np.argmin(ends))
 
 
+@pytest.mark.slow
 def test_an_encoder_is_trained_once_and_gives_the_code_about_which_starts_are_drawn(tmp_path):
     prior, camera = Prior(PRIOR.decoder, 3 * PRIOR.codes), CAMERA
     encoder = EncoderSettings((8,), 1, 16, 6, 4, 8, OptimiserSettings(80, 0.01, "cosine"))
@@ -221,6 +222,7 @@ def test_gradients_reach_the_pixels():
     assert torch.autograd.gradcheck(lambda p: sample(image, p)[0], positions)
 
 
+@pytest.mark.slow
 def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is_put_there(tmp_path):
     idr(tmp_path)
     overrides = ("task=multiview", "dataset=photos", f"dataset.path={tmp_path}", "scale=smoke", "threads=1")

@@ -39,7 +39,7 @@ def test_a_background_has_finite_colours_on_all_rays(name):
 def test_a_learnt_background_fits_a_distant_texture():
     torch.manual_seed(0)
     background, wanted = OutsideSphere(), (RAYS.directions + 1) / 2
-    optimiser = torch.optim.Adam(background.parameters(), lr=0.01)
+    optimiser = torch.optim.Adam(background.parameters(), lr=0.001)
     for _ in range(150):
         optimiser.zero_grad()
         (background(RAYS) - wanted).abs().mean().backward()

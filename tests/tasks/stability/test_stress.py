@@ -152,6 +152,7 @@ def outcome_of(stress: Stress, level: float, repeat: int) -> dict[str, float]:
     return {name: n for name, n in numbers.items() if name not in ("evaluations_per_ray", "hits")}
 
 
+@pytest.mark.slow
 @each("name", NAMES)
 def test_repeats_of_a_trial_have_other_outcomes_or_there_is_one_trial(name):
     stress = stress_named(name)
@@ -247,6 +248,7 @@ def test_a_disturbed_fit_ends_further_off(scene):
     assert mild.success and severe.numbers["surface_error"] > mild.numbers["surface_error"]
 
 
+@pytest.mark.slow
 @each("name", ["growing_slope", "new_hole", "outside_family", "thin_parts", "one_sided_views"])
 def test_a_fit_of_a_code_succeeds_at_the_mild_end_and_fails_at_the_severe_one(name):
     stress = stress_named(name)
