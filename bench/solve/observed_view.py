@@ -181,14 +181,8 @@ class ObservedView:
         """The weighted loss terms of DIST, Eq. 5."""
         renderer = at_iteration(self.renderer, iteration)
         rendering = render_checked(renderer, field, self.rays)
-        if self.camera is None:
-            depth, hit = rendering.distance * self.depth_per_distance, rendering.hit
-        else:
-            depth, hit = mean_depth(rendering, self.camera.cosine(self.rays))
-        compared = self.observed & hit
-        error = depth_error(self.settings.depth_loss, depth, self.depth, self.depth_per_distance)
-        count = observed_hits(hit, self.observed, self.expected_observed)
-        terms = {"depth": self.settings.depth_weight * (error * compared).sum() / count}
+        depth, compared = self.depth_term(rendering)
+        terms = {"depth": depth}
         if self.normals is not None:
             gradients = central_differences(field, rendering.points[compared], self.normal_width)
             error = normal_error(torch.nn.functional.normalize(gradients, dim=-1), self.normals[compared])
@@ -196,15 +190,31 @@ class ObservedView:
         if self.colours is not None:
             terms["colour"] = self.colour_weight * self._colour_error(field, rendering)
         if self.mask is not None:
-            distance = torch.where(self.observed, self.depth / self.depth_per_distance, torch.nan)
-            observed = (
-                RayObservation(self.mask, distance)
-                if self.covered is None
-                else observation_of(self.covered, distance, rendering)
-            )
-            silhouette = self.settings.silhouette(renderer, field, self.rays, rendering, observed)
-            terms["silhouette"] = self.settings.silhouette_weight * silhouette
+            terms["silhouette"] = self.silhouette_term(renderer, field, rendering, self.mask)
         return terms
+
+    def depth_term(self, rendering: Rendering) -> tuple[Float[Tensor, ""], Bool[Tensor, "*rays"]]:
+        """The weighted mean error of depths, and the observed rays that hit, over which it is the mean."""
+        if self.camera is None:
+            depth, hit = rendering.distance * self.depth_per_distance, rendering.hit
+        else:
+            depth, hit = mean_depth(rendering, self.camera.cosine(self.rays))
+        compared = self.observed & hit
+        error = depth_error(self.settings.depth_loss, depth, self.depth, self.depth_per_distance)
+        count = observed_hits(hit, self.observed, self.expected_observed)
+        return self.settings.depth_weight * (error * compared).sum() / count, compared
+
+    def silhouette_term(
+        self, renderer: Renderer, field: Field, rendering: Rendering, mask: Bool[Tensor, "*rays"]
+    ) -> Float[Tensor, ""]:
+        """The weighted silhouette loss."""
+        distance = torch.where(self.observed, self.depth / self.depth_per_distance, torch.nan)
+        if self.covered is None:
+            observation = RayObservation(mask, distance)
+        else:
+            observation = observation_of(self.covered, distance, rendering)
+        loss = self.settings.silhouette(renderer, field, self.rays, rendering, observation)
+        return self.settings.silhouette_weight * loss
 
     def _colour_error(self, field: Field, rendering: Rendering) -> Float[Tensor, ""]:
         """The mean absolute error of colours over hits on pixels that show the shape (DIST, B.3)."""

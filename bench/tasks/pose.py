@@ -1,7 +1,7 @@
 """Camera pose: optimises the camera of a depth image and mask of a known shape (DIST, Sec. 4.1, Fig. 6)."""
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from math import atan2, degrees, radians, sqrt
 from typing import ClassVar
@@ -23,24 +23,18 @@ from bench.records.record import digest
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import load_or_make
 from bench.solve.latent_code import total
-from bench.solve.observed_view import (
-    DEPTH_LOSSES,
-    depth_error,
-    expected_in_draw,
-    normal_error,
-    observed_hits,
-)
+from bench.solve.observed_view import DEPTH_LOSSES, ObservedView, normal_error
 from bench.solve.optimise import OptimiserSettings, Starts, StartSettings, with_affordable_rays
-from bench.solve.pixel_area import mean_depth, observation_of, random_rays
+from bench.solve.pixel_area import random_rays
 from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import solve_and_draw
 from datasets.scene import Scene, View, see, see_area
 from renderers.boundary import render_checked
-from renderers.camera import Camera, Rays
+from renderers.camera import Camera
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.field import Counts, Field, Meter, autograd_normals
 from renderers.fields.grid import Grid
-from renderers.rendering import RayObservation, Renderer, Unsupported, at_iteration
+from renderers.rendering import Renderer, Unsupported, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
 DEFINITIONS = {
@@ -226,14 +220,17 @@ class PoseProblem:
         self.cameras = [camera.to(self.device) for camera in self.cameras]
         self.parameters = [torch.zeros(6, device=self.device, requires_grad=True) for _ in self.cameras]
         self.starts = Starts(StartSettings(len(self.cameras), self.settings.trial))
-        self.depth, self.observed = self.view.depth.to(self.device), self.view.mask.to(self.device)
-        self.depth_per_distance = self.cameras[0].depth(torch.ones_like(self.depth))  # all starts have its lens
+        mask = self.view.mask
+        self.observations = ObservedView.of(
+            self.view, self.settings, self.renderer, observed=mask, mask=mask, device=self.device
+        )
+        self.observed = self.observations.observed
+        if self.area is not None:
+            covered, depth = (image.to(self.device) for image in self.area)
+            depth = torch.where(self.observed, depth, 0.0)
+            self.observations = replace(self.observations, depth=depth, covered=covered)
         self.draw = PixelDraw(self.observed, self.settings.pixel_block, self.seed)
         self.rays_per_iteration = self.draw.per_iteration * self.rays_per_pixel
-        self.covered = self.observed.to(self.depth.dtype)
-        if self.area is not None:
-            self.covered, depth = (image.to(self.device) for image in self.area)
-            self.depth = torch.where(self.observed, depth, 0.0)
         self.normals = in_camera_axes(self.view.normals.to(self.device), self.view.camera.to(self.device))
 
     def field(self) -> Field:
@@ -270,31 +267,19 @@ class PoseProblem:
     def _compare(self, shape: Field, step: int, start: int, pixels: Tensor | None = None) -> dict[str, Tensor]:
         """The weighted terms of a start at the pixels [n] of an image by rows, or at all, and their sum."""
         camera = self.cameras[start].with_object_moved(self.parameters[start])
-        renderer, count = at_iteration(self.renderer, step), self.rays_per_pixel
-        rays = camera.rays() if self.area is None else random_rays(camera, count, self.seed, step)
-        observations = self.depth, self.depth_per_distance, self.observed, self.normals, self.covered
+        if self.area is None:
+            view = replace(self.observations, rays=camera.rays())
+        else:
+            rays = random_rays(camera, self.rays_per_pixel, self.seed, step)
+            view = replace(self.observations, rays=rays, camera=camera)
+        normals = self.normals
         if pixels is not None:
             pixels = pixels.to(self.device)
-            rays = Rays(rays.origins.flatten(0, 1)[pixels], rays.directions.flatten(0, 1)[pixels])
-            observations = [tensor.flatten(0, 1)[pixels] for tensor in observations]
-        depth, depth_per_distance, observed, normals, covered = observations
-        rendering = render_checked(renderer, shape, rays)
-        distance = torch.where(observed, depth / depth_per_distance, torch.nan)
-        if self.area is None:
-            rendered, hit = rendering.distance * depth_per_distance, rendering.hit
-            observation = RayObservation(observed, distance)
-        else:
-            rendered, hit = mean_depth(rendering, camera.cosine(rays))
-            observation = observation_of(covered, distance, rendering)
-        compared = observed & hit
-        expected = None if pixels is None else expected_in_draw(self.observed, len(pixels))
-        count = observed_hits(hit, observed, expected)
-        error = depth_error(self.settings.depth_loss, rendered, depth, depth_per_distance)
-        silhouette = self.settings.silhouette(renderer, shape, rays, rendering, observation)
-        terms = {
-            "depth": self.settings.depth_weight * (error * compared).sum() / count,
-            "silhouette": self.settings.silhouette_weight * silhouette,
-        }
+            view, normals = view.flat().drawn(pixels), normals.flatten(0, 1)[pixels]
+        renderer = at_iteration(self.renderer, step)
+        rendering = render_checked(renderer, shape, view.rays)
+        depth, compared = view.depth_term(rendering)
+        terms = {"depth": depth, "silhouette": view.silhouette_term(renderer, shape, rendering, view.observed)}
         if self.settings.normal_weight:
             rendered_normals = in_camera_axes(autograd_normals(shape, rendering.points[compared].detach()), camera)
             terms["normals"] = self.settings.normal_weight * normal_error(rendered_normals, normals[compared])
