@@ -14,7 +14,7 @@ from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
 from renderers.field import Coloured, Field, Kind, Meter
-from renderers.rendering import RayObservation, Renderer, Volume
+from renderers.rendering import RayObservation, Renderer, Rendering, Volume
 from renderers.silhouette import SilhouetteLoss
 
 CUBE_POINTS = 512  # random points of the cube, for `eikonal` and `heat`
@@ -102,35 +102,8 @@ class Losses:
         gradients = gradients_at(metered, points)
         normals = torch.nn.functional.normalize(gradients, dim=-1)
         terms: Terms = {}
-        needs_masks = rendering.volume is not None and pixels.mask is None and background is None
-        if (self.colour or self.colour_gradient) and needs_masks:
-            reason = "needs masks: without them it would paint what is behind too"
-            raise BadInput(f"{type(renderer).__name__} {reason}; +task.background=sphere learns what is behind")
-        if self.colour and self.colour_of == SAMPLES:
-            if rendering.volume is None:
-                raise BadInput(f"{type(renderer).__name__} has no samples: take task.losses.colour_of=blended")
-            if pixels.mask is None:
-                raise BadInput("task.losses.colour_of=samples needs masks: take colour_of=blended")
-            errors = _sample_errors(shape, metered, pixels, rendering.volume)[pixels.mask]
-            terms["colour"] = self.colour * errors.sum() / rays
-        elif self.colour or self.colour_gradient:
-            if rendering.volume is None:
-                compared, colours = inside, shape.colours(points, gradients, pixels.rays.directions[inside])
-                if background is not None:
-                    compared = torch.ones_like(inside)
-                    colours = background(pixels.rays).index_put((inside,), colours)
-            elif background is not None:
-                compared, opacity = torch.ones_like(inside), rendering.opacity[:, None]
-                colours = _volume_colours(shape, metered, pixels.rays, rendering.volume)
-                colours = colours + (1 - opacity) * background(pixels.rays)
-            else:
-                compared = pixels.mask
-                colours = _volume_colours(shape, metered, pixels.rays, rendering.volume)[compared]
-            difference = torch.zeros_like(pixels.colours).index_put((compared,), colours - pixels.colours[compared])
-            if self.colour:
-                terms["colour"] = self.colour * difference.abs().sum() / rays
-            if self.colour_gradient:
-                terms["colour_gradient"] = self.colour_gradient * _neighbour_error(difference, compared) / rays
+        if self.colour or self.colour_gradient:
+            terms |= self._colour_terms(renderer, shape, metered, pixels, rendering, gradients, background)
         if self.depth and pixels.distance is not None:
             measured = rendering.hit & pixels.distance.isfinite()
             scale = pixels.depth_per_distance[measured]
@@ -159,6 +132,48 @@ class Losses:
         if not terms:
             raise BadInput("no term of the loss is left: give a weight of task.losses that the photographs can serve")
         return {"total": total(terms), **terms}
+
+    def _colour_terms(
+        self,
+        renderer: Renderer,
+        shape: Coloured,
+        metered: Meter,
+        pixels: Pixels,
+        rendering: Rendering,
+        gradients: Float[Tensor, "hits 3"],
+        background: Background | None,
+    ) -> Terms:
+        """The terms of colours; `gradients` are those of the field at hits inside of the masks."""
+        rays, volume = len(pixels.colours), rendering.volume
+        if volume is not None and pixels.mask is None and background is None:
+            reason = "needs masks: without them it would paint what is behind too"
+            raise BadInput(f"{type(renderer).__name__} {reason}; +task.background=sphere learns what is behind")
+        if self.colour and self.colour_of == SAMPLES:
+            if volume is None:
+                raise BadInput(f"{type(renderer).__name__} has no samples: take task.losses.colour_of=blended")
+            if pixels.mask is None:
+                raise BadInput("task.losses.colour_of=samples needs masks: take colour_of=blended")
+            return {"colour": self.colour * _sample_errors(shape, metered, pixels, volume)[pixels.mask].sum() / rays}
+        inside = rendering.hit if pixels.mask is None else rendering.hit & pixels.mask
+        compared = inside if background is None else torch.ones_like(inside)
+        if volume is None:
+            colours = shape.colours(rendering.points[inside], gradients, pixels.rays.directions[inside])
+            if background is not None:
+                colours = background(pixels.rays).index_put((inside,), colours)
+        else:
+            colours = _volume_colours(shape, metered, pixels.rays, volume)
+            if background is not None:
+                colours = colours + (1 - rendering.opacity[:, None]) * background(pixels.rays)
+            elif pixels.mask is not None:
+                compared = pixels.mask
+                colours = colours[compared]
+        difference = torch.zeros_like(pixels.colours).index_put((compared,), colours - pixels.colours[compared])
+        terms: Terms = {}
+        if self.colour:
+            terms["colour"] = self.colour * difference.abs().sum() / rays
+        if self.colour_gradient:
+            terms["colour_gradient"] = self.colour_gradient * _neighbour_error(difference, compared) / rays
+        return terms
 
 
 def _volume_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "n 3"]:
