@@ -143,7 +143,10 @@ class ConditionCurves:
         if len(differ) < len(ratios):
             undecided = statistics.Verdict.NOT_DECIDABLE in verdicts.values()
             reason = "too few shapes" if undecided else "no significant difference from 1"
-            parts.append(f"{format.plural(len(ratios) - len(differ), 'other row')}: {reason}")
+            if differ:
+                parts.append(f"{format.plural(len(ratios) - len(differ), 'other row')}: {reason}")
+            else:
+                parts = [f"{name} *{format.number(ratio.value)}*, {reason}" for name, ratio in ratios.items()]
         shapes = sorted({len(ratio.points) for ratio in ratios.values()})
         return f"{self.verdict}: {'; '.join(parts)}; n = {' or '.join(map(str, shapes))} shapes." if ratios else ""
 
