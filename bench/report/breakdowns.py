@@ -122,26 +122,26 @@ def _mark(cell: Any) -> str:
 
 def _breakdown_texts(cell: Any, unit: str) -> tuple[str, str]:
     """The breakdown as a short text, and as a text with its interval or the failures at an end of the sweep."""
-    mild, severe = (_failures(cell, end) for end in ENDS)
+    mild, severe = (failures(cell, end) for end in ENDS)
     low, high = ("" if math.isnan(end) else format.number(end) for end in (cell.breakdown_low, cell.breakdown_high))
     if not cell.is_measured:
         return (format.MISSING if cell.status == "unsupported" else cell.status,) * 2
     if cell.rises:
         return "rises", f"success rises with severity (mild: {mild}; severe: {severe})"
     if cell.at_once:
-        return "at once", f"at once ({mild}{f', up to {high}{unit}' if high else ''})"
+        return "mildest", f"breaks at the mildest ({mild}{f'; interval to {high}{unit}' if high else ''})"
     if cell.never:
-        return "none", f"none ({severe}{f', from {low}{unit}' if low else ''})"
+        return "never", f"survives the severest ({severe}{f'; interval from {low}{unit}' if low else ''})"
     short = format.number(cell.breakdown)
     interval = "one trial" if cell.one_trial else f"{low or 'beyond'} to {high or 'beyond'}"
     return short, f"{short}{unit} ({interval})"
 
 
-def _failures(cell: Any, end: str) -> str:
-    """The number of failed trials at an end of the sweep; with repeats, the interval of their fraction too."""
+def failures(cell: Any, end: str) -> str:
+    """The number of failed trials at an end of the sweep; with repeats, the interval of their probability too."""
     successes, trials = (getattr(cell, f"{end}_{name}") for name in ("successes", "trials"))
     if not trials > 0:
         return "not tried"
     rate = statistics.clopper_pearson(1 - successes / trials, trials)
     share = "" if cell.one_trial else f", {100 * rate.low:.0f}-{100 * rate.high:.0f} %"
-    return f"{trials - successes:.0f} of {trials:.0f} failed{share}"
+    return f"{trials - successes:.0f} of {trials:.0f} trials failed{share}"

@@ -48,7 +48,7 @@ class ConditionCurves:
         absent: the value of the condition in runs without the key.
         reference: preset of the row with which the verdict compares the others at `compared`; empty: each row is
             compared with itself at `first`.
-        only_in_table: presets that the figure leaves out.
+        only_in_table: presets that the figure leaves out, and the verdict too without a `reference`.
     """
 
     condition: str
@@ -121,9 +121,9 @@ class ConditionCurves:
         return statistics.ratio(*(_shapes(each.loc[common][key]) for each in (group, first))) if len(common) else None
 
     def _over_first(self, lines: list[Line]) -> dict[str, statistics.Interval]:
-        """The ratio of each row at the compared value to the row at the first value."""
+        """The ratio of each row of the figure at the compared value to the row at the first value."""
         compared = [line for line in lines if line["value"] == self.compared and line["gain"] is not None]
-        return {line["name"]: line["gain"] for line in compared}
+        return {line["name"]: line["gain"] for line in compared if line["preset"] not in self.only_in_table}
 
     def _against_reference(self, frame: pd.DataFrame) -> dict[str, statistics.Interval]:
         """The ratio of each other row to the reference row, at the compared value."""
@@ -155,11 +155,17 @@ class ConditionCurves:
         for line in lines:
             if line["preset"] not in self.only_in_table:
                 rows.setdefault((line["name"], line["preset"]), []).append(line)
+        values = sorted({line["value"] for line in lines})
         curves = [
-            chart.curve(*row, [line["value"] for line in points], [line["estimates"][measure.key] for line in points])
+            chart.curve(
+                *row,
+                [values.index(line["value"]) for line in points],
+                [line["estimates"][measure.key] for line in points],
+            )
             for row, points in rows.items()
         ]
-        return chart.panel_data("", self.heading.lower(), measure.heading, curves)
+        ticks = [format.number(value) for value in values]
+        return chart.panel_data("", self.heading.lower(), measure.heading, curves, ticks=ticks)
 
 
 def _whole(value: float) -> float | int:

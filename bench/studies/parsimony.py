@@ -36,11 +36,11 @@ NOTES = (
     "held-out rays, most of them of other views.",
     "A field under half a pixel at the nearest distance suffices for these pixels. A field within one standard error "
     "of the least error is as good as the best: it suffices for the scene, as far as these candidates show.",
-    "A candidate is chosen only if it also suffices on {held:.0f} % or more of random draws of further views. "
-    "Unchecked: the run has no such draws of this candidate.",
-    "Overhead: the seconds of all candidates that field=auto tried, relative to its final fit. Pixel precision: the "
-    "recommended candidate fitted again with renderer.epsilon=auto, renderer.steps=auto and rays that follow the loss, "
-    "relative to its plain fit.",
+    "A field that was checked on further views is chosen only if it suffices on {held:.0f} % or more of random draws "
+    "of these. Unchecked: the run has no such draws of this field.",
+    "`field=auto` recommends the field with the fewest numbers under half a pixel. Evaluations at pixel precision are "
+    "those of a second fit of it, over those of the first. The second fit has renderer.epsilon=auto, "
+    "renderer.steps=auto and rays that follow the loss.",
 )
 POINT = (
     "The larger a marker, the more numbers its field stores. Hollow markers: the last round still reduced the error. "
@@ -175,7 +175,7 @@ def _front(line: Line, dash: str, *, several: bool) -> list[chart.Series]:
         return []
     x, y = ([value for (value,) in values] for values in zip(*points, strict=True))
     suffix = f" at {line['pixels']} pixels" if several else ""
-    front = chart.front(x, y) | {"name": f"front{suffix}", "dash": dash, "quiet": False}
+    front = chart.front(x, y) | {"name": f"front of error and FLOPs{suffix}", "dash": dash, "quiet": False}
     level = chart.level("half a pixel", x, 1000 * line["footprint"], colour=PIXEL_COLOUR, dash=":")
     return [front, level]
 
@@ -203,7 +203,7 @@ def draw(panels: list[chart.Panel], labels: list[Labels]) -> Figure:
             axis.annotate(label, (x, y), (0, -14), textcoords="offset points", ha="center", fontsize=6.5)
         axis.margins(y=0.16)
     axis = figure.axes[0]
-    axis.plot([], [], "s", mfc="none", color="#666666", label="error still fell")
+    axis.plot([], [], "p", mfc="none", color="#666666", label="hollow: error still fell")
     for stored in MARKER_EXAMPLES:
         axis.plot([], [], "o", ms=marker_points(stored), color="#bbbbbb", label=f"{stored:,} numbers")
     figure_style.legend_below(figure, *figure.axes, columns=4)
@@ -260,7 +260,7 @@ COLUMNS = (  # a line is a run
     ),
     table.shown("Least error × 1000", _best),
     table.text("stopped", "Error still fell"),
-    table.Column("auto.overhead", "Overhead of field=auto"),
+    *table.raw("auto.overhead"),
     *table.columns(_factor, frugal_evaluations="Evaluations at pixel precision"),
     table.text("lost", "Failed candidates"),
 )

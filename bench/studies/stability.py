@@ -39,16 +39,19 @@ MARKS = {
     "×": "breaks at the mildest",
     "↑": "fails at the mildest, survives the severest",
     "–": "lacks the setting, or refuses the field",
+    "": "not run",
 }
 GROUP_GAP_COLUMNS = 0.7
 LINE_INCHES, LABEL_INCHES = 0.155, 1.15  # the height of a renderer, and of the labels above the heat map
 NOTES = (
-    "An empty cell was not run.",
-    "Severity is a share of the axis: 0 % is the mildest severity, 100 % the severest. A darker cell survives harder "
-    "cases.",
-    "“Breaks first” and “Then” are the axes with the lowest breakdowns. Of equal ones, they are those with the highest "
-    "median of all renderers. “Best on” is the axis with the largest distance above that median. Settings of renderers "
-    "are left out. “At once” and “none”: at the mildest and at the severest severity, with the failed trials.",
+    "A rendering fails if more than 1 % of its true hits are missed or farther off than the pixel's footprint, or if "
+    "it has spurious hits of more than 1 %. A gradient fails below a cosine of 0.99, or if its length is 10 % off. A "
+    "fit fails if the error of its surface is above 0.02 scene units.",
+    "A breakdown is the severity at which half of the trials fail, as a percentage of the axis: 0 % is the mildest "
+    "severity, 100 % the severest. In brackets: its interval, or the failed trials at that end of the axis.",
+    "“Breaks first” and “Then” are the axes with the lowest breakdowns. Among equal ones, the axis on which the median "
+    "renderer survives most is shown. “Best on” is the axis on which the renderer is farthest above the median "
+    "renderer. Settings of renderers are left out.",
     "Intervals are those of the shown axis. They do not cover the choice of the axis. The mean rank is over the "
     "{ranked_axes} axes that judge renderings, with its bootstrap interval over axes.",
     "Each renderer has one preset. The page “stability_axes” has all presets and all numbers.",
@@ -72,10 +75,10 @@ def make(runs: Runs) -> Result:
         "What breaks each renderer first.",
         "Per renderer and axis (kind of stress), the severity at which half of the trials succeed.",
         question="What breaks each renderer first?",
-        verdict=_hardest_axis(compared, len(rows)),
+        verdict=_hardest_axis(compared),
         n=f"{ranked['trials'].sum():.0f} trials in all, of {len(axes)} axes and {len(rows)} renderers",
         interval="95 % credible intervals of breakdowns",
-        remarks=[note.format(ranked_axes=shared["axis"].nunique()) for note in NOTES],
+        remarks=[*(note.format(ranked_axes=shared["axis"].nunique()) for note in NOTES), *_equal_rows(shared)],
         data=_data(runs, cells, axes),
         columns=FIRST_COLUMNS,
         lines=lines,
@@ -174,12 +177,26 @@ def draw(cells: pd.DataFrame, axes: pd.DataFrame, rows: list[str]) -> Figure:
         for name, x in _group_titles(block, axes["group"]):
             panel.text(x, len(rows) - 0.2, name, ha="center", va="top", fontsize=7, fontweight="bold")
     bar = figure.colorbar(ScalarMappable(cmap=SURVIVED), ax=panels, location="bottom", shrink=0.4, aspect=30, pad=0.02)
-    bar.set_ticks([0.0, 1.0], labels=["breaks at the mildest", "survives the severest"])
+    bar.set_ticks([0.0, 0.5, 1.0], labels=["0 %: mildest", "50 %", "100 %: severest"])
+    bar.set_label("breakdown, as a percentage of the axis", fontsize=7)
     bar.ax.tick_params(length=0)
-    shown = [mark for mark in MARKS if marks.eq(mark).any(axis=None)]
-    handles = [Line2D([], [], ls="none", marker=f"${mark}$", color=_mark_colour(mark, 0), ms=5) for mark in shown]
-    figure.legend(handles, [MARKS[mark] for mark in shown], loc="outside lower center", ncols=len(handles) or 1)
+    shown = [mark for mark in MARKS if (marks.eq(mark) if mark else marks.isna()).any(axis=None)]
+    figure.legend(
+        [_mark_handle(mark) for mark in shown],
+        [MARKS[mark] for mark in shown],
+        loc="outside lower center",
+        ncols=len(shown) or 1,
+    )
     return figure
+
+
+def _mark_handle(mark: str) -> tuple[Line2D, Line2D]:
+    """A mark for the legend, on the shade on which it stands in the heat map."""
+    shade = {"×": 0.0, "↑": 1.0}.get(mark)
+    cell = SURVIVED(shade) if shade is not None else "white"
+    sign = Line2D([], [], ls="none", marker=f"${mark}$" if mark else "", color=_mark_colour(mark, shade or 0), ms=5)
+    edge = "#cccccc" if mark in ("", "–") else cell
+    return Line2D([], [], ls="none", marker="s", color=cell, markeredgecolor=edge, markeredgewidth=0.6, ms=8), sign
 
 
 def _draw_block(panel: Axes, groups: list[list[str]], shades: pd.DataFrame, marks: pd.DataFrame) -> None:
@@ -243,7 +260,9 @@ def _share_words(key: str) -> Callable[[dict[str, Any]], str]:
         if (cell := line[key]) is None:
             return format.MISSING
         if cell.at_once or cell.never:
-            return f"{breakdowns.title(cell.axis)}, {cell.words}"
+            word, end = ("mildest", "mild") if cell.at_once else ("survives", "severe")
+            trials, successes = (getattr(cell, f"{end}_{name}") for name in ("trials", "successes"))
+            return f"{breakdowns.title(cell.axis)}, {word} ({trials - successes:.0f} of {trials:.0f} trials failed)"
         low, high = (100 * min(max(end, 0.0), 1.0) for end in (cell.level_low, cell.level_high))
         interval = "(one trial)" if cell.one_trial else f"[{low:.0f}, {high:.0f}]"
         return f"{breakdowns.title(cell.axis)}, {100 * cell.shade:.0f} % {interval}"
@@ -260,14 +279,32 @@ FIRST_COLUMNS = (
 )
 
 
-def _hardest_axis(cells: pd.DataFrame, renderers: int) -> str:
+def _equal_rows(cells: pd.DataFrame) -> list[str]:
+    """A sentence on the renderers that break at the same severities on all axes of renderings, if there are any."""
+    groups: dict[tuple[float, ...], list[str]] = {}
+    for row, levels in cells.pivot(index="row", columns="axis", values="level").iterrows():
+        if levels.notna().all():
+            groups.setdefault(tuple(levels), []).append(str(row))
+    return [
+        f"{' and '.join(rows)} break at the same severities in all renderings."
+        for rows in groups.values()
+        if len(rows) > 1
+    ]
+
+
+def _hardest_axis(cells: pd.DataFrame) -> str:
     """A sentence on the axis on which most renderers break at the mildest severity; empty if none does."""
     counts = cells[cells["at_once"]].groupby("axis").size().sort_values(ascending=False, kind="stable")
     if counts.empty:
         return ""
-    hardest = " and ".join(breakdowns.title(str(axis)) for axis in counts.index[counts == counts.iloc[0]])
-    axes, most = cells["axis"].nunique(), counts.iloc[0]
-    return f"The hardest of {axes} axes: {hardest}, at whose mildest severity *{most}* of {renderers} renderers break."
+    hardest = [str(axis) for axis in counts.index[counts == counts.iloc[0]]]
+    names = " and ".join(map(breakdowns.title, hardest))
+    shares = " and ".join(f"*{counts.iloc[0]} of {(cells['axis'] == axis).sum()}*" for axis in hardest)
+    verb, whose = ("is", "its") if len(hardest) == 1 else ("are", "their")
+    return (
+        f"Of {cells['axis'].nunique()} axes, {names} {verb} the hardest: at {whose} mildest severity, {shares} tested "
+        "renderers break."
+    )
 
 
 PAGES = {"stability": make}

@@ -77,7 +77,7 @@ def make(*several: Runs | None) -> Result:
         replace(runs, records=[], left_out=Counter()),  # kept attempts count even if their run folders are gone
         "The suite.",
         "Progress of each renderer from the initial to the best possible error, at equal costs; in brackets, its "
-        "possible ranks. A cross: all runs failed.",
+        "possible ranks. Each budget has its own runs, so a renderer has a line per budget. A cross: all runs failed.",
         question="Which renderer makes the most progress, at the same cost?",
         verdict=verdict(made),
         n=_sample(made),
@@ -171,9 +171,10 @@ def _sample(made: Standing) -> str:
         scenes, renderers = (
             format.plural(runs[name].nunique(), word) for name, word in (("scene", "scene"), ("row", "renderer"))
         )
-        failed = f"{(~runs['ok']).sum() or 'none'} of {format.plural(len(runs), 'run')} failed"
-        parts.append(f"at {_when(made, budget)}, {problems} ({scenes}), {renderers}, {failed}")
-    return f"{suite().id}: {'; '.join(parts) or 'no runs'}"
+        failed = f"{(~runs['ok']).sum() or 'none'} failed"
+        count = format.plural(len(runs), "run")
+        parts.append(f"{count} at {_when(made, budget)}: {problems} of {scenes}, {renderers}, {failed}")
+    return f"{'; '.join(parts) or 'no runs'}; suite {suite().id}"
 
 
 def _sets_at(made: Standing, budget: float) -> list[str]:
@@ -200,7 +201,8 @@ def _panel(made: Standing, of_set: str | None) -> chart.Panel:
     counts = runs.groupby("budget")["scene"].nunique()
     fewer = [f", {count} at {units(float(b))}" for b, count in counts.items() if count < counts.max()]
     scenes = format.plural(int(counts.max() if len(counts) else 0), "scene")
-    title = f"{of_set}, {scenes}" if of_set else f"Progress over cost, all sets, {scenes}{''.join(fewer)}"
+    sets = ", all sets" if all(_sets_at(made, budget) == made.sets for budget in made.budgets) else ""
+    title = f"{of_set}, {scenes}" if of_set else f"Progress over cost{sets}, {scenes}{''.join(fewer)}"
     panel = chart.panel_data(title, COST, "progress", lines)
     panel["x"]["log"], panel["y"]["log"] = True, False
     return panel

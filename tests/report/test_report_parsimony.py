@@ -59,7 +59,7 @@ def page(four):
 def test_a_row_a_scene_the_least_need_first_and_a_failed_run_last(page):
     assert list(page.table["Scene"]) == ["ball 0", "box 0", "car 0", "torus 0"]
     empty = list(page.table.iloc[3])[2:]
-    assert set(empty) == {"crashed", "–"} and len(empty) == len(parsimony.COLUMNS) - 2
+    assert set(empty) == {"crashed", "–"} and len(empty) == len(page.table.columns) - 2
     lost = page.data[page.data["scene"] == "torus 0"]
     assert (lost["status"].item(), lost["reason"].item()) == ("crashed", "why")
     assert "1 of 4 runs did not end ok: dist, 64 resolution, torus: crashed (why)." in told(page)
@@ -92,7 +92,7 @@ def test_resolutions_are_lines_of_a_scene_and_fronts_of_its_panel(tmp_path):
     page = page_of(tmp_path, "parsimony")
     assert list(page.table["Pixels"]) == ["48", "96"] and len(page.chart["panels"]) == 1
     fronts = [each["name"] for each in page.chart["panels"][0]["series"] if each.get("step")]
-    assert fronts == ["front at 96 pixels", "front at 48 pixels"]
+    assert fronts == [f"front of error and FLOPs at {pixels} pixels" for pixels in (96, 48)]
     assert page.verdict.count("scenes and resolutions") == 1
 
 
@@ -108,7 +108,7 @@ def test_choices_have_rings_and_the_front_and_half_a_pixel_are_drawn(page):
     rings = {each["name"]: (each["x"], each["y"]) for each in panel["series"] if each["colour"] == "#111111"}
     assert set(map(str, rings.values())) == {"([6000.0], [18.0])"} and len(rings) == 2
     lines = {each["name"]: each["y"] for each in panel["series"] if "dash" in each}
-    assert lines == {"front": [160, 40, 18], "half a pixel": [20, 20]}
+    assert lines == {"front of error and FLOPs": [160, 40, 18], "half a pixel": [20, 20]}
     small, large = (each["size"] for each in panel["series"] if each["name"] in ("one part", "narrow-band grid"))
     assert small < large and len(page.figure.axes) == 4
 
@@ -124,11 +124,11 @@ def test_a_candidate_that_failed_is_counted_and_crossed_and_one_that_was_stopped
     assert next(each["x"] for each in page.chart["panels"][0]["series"] if each.get("hollow")) == [8]
 
 
-def test_field_auto_and_pixel_precision_stand_beside(page, tmp_path):
-    names = ["Overhead of field=auto", "Evaluations at pixel precision"]
-    assert page.table.set_index("Scene").loc["box 0", names].tolist() == ["1.50", "0.250×"]
-    climbed(tmp_path, "car", {"sphere": 8, "box": 0.9}, needs="box", **{"frugal.error": ..., "auto.overhead": ...})
-    assert page_of(tmp_path, "parsimony").table[names].iloc[0].tolist() == ["–", "–"]
+def test_the_evaluations_at_pixel_precision_are_relative_to_the_first_fit(page, tmp_path):
+    name = "Evaluations at pixel precision"
+    assert page.table.set_index("Scene").loc["box 0", name] == "0.250×"
+    climbed(tmp_path, "car", {"sphere": 8, "box": 0.9}, needs="box", **{"frugal.error": ...})
+    assert page_of(tmp_path, "parsimony").table[name].tolist() == ["–"]
 
 
 def test_a_page_is_made_even_where_all_runs_failed(tmp_path):

@@ -71,11 +71,11 @@ def test_a_renderer_has_the_axes_on_which_it_breaks_first_and_the_one_on_which_i
     broke(tmp_path, "alpha", "DIST", 0.01)  # a setting of the renderer is not compared
     page = page_of(tmp_path, "stability")
     rows = page.table.set_index("Renderer")
-    at_once, never = "narrow gap, at once (5 of 5 failed, 48-100 %)", "thin plate, none (0 of 5 failed, 0-52 %)"
+    at_once, never = "narrow gap, mildest (5 of 5 trials failed)", "thin plate, survives (0 of 5 trials failed)"
     assert rows.loc["DIST"].tolist()[:3] == [at_once, "fine bumps, 20 % [15, 25]", never]
     firsts = ["thin plate, 30 % [25, 35]", "fine bumps, 40 % [35, 45]"]
     assert rows.loc["DVR"].tolist()[:3] == [*firsts, "narrow gap, 50 % [45, 55]"]
-    assert "narrow gap, at whose mildest severity *1* of 2 renderers break." in page.verdict
+    assert "narrow gap is the hardest: at its mildest severity, *1 of 2* tested renderers" in page.verdict
     labels = [label.get_text() for label in page.figure.axes[0].get_xticklabels()]
     assert labels == ["large alpha", "narrow gap", "fine bumps", "thin plate", "thin wires"]
 
@@ -120,7 +120,7 @@ def test_one_trial_per_level_has_no_interval_anywhere(tmp_path):
     result = page_of(tmp_path, "stability")
     assert page_of(tmp_path, "stability_axes").table.loc[0, ["DIST", "DVR"]].tolist() == [
         "0.100 (one trial)",
-        "at once (1 of 1 failed)",
+        "breaks at the mildest (1 of 1 trials failed)",
     ]
     assert result.data[["breakdown_low", "breakdown_high", "level_low", "level_high"]].isna().all(axis=None)
     curves = page_of(tmp_path, "stability_curves").data
@@ -143,9 +143,10 @@ def test_the_ends_of_a_sweep_have_the_count_behind_them(tmp_path):
     broke(tmp_path, "wires", "DVR", 1.1)
     broke(tmp_path, "wires", "IDR", 0.5, mild_successes=1, severe_successes=4)
     row = page_of(tmp_path, "stability_axes").table.iloc[0]
-    assert row["DIST"] == "at once (5 of 5 failed, 48-100 %)"
-    assert row["DVR"] == "none (0 of 5 failed, 0-52 %)"  # 0 of 5 still allows 52 %: 1 - 0.025^(1/5)
-    assert row["IDR"].startswith("success rises with severity (mild: 4 of 5 failed")
+    assert row["DIST"] == "breaks at the mildest (5 of 5 trials failed, 48-100 %)"
+    # 0 of 5 still allows 52 %: 1 - 0.025^(1/5)
+    assert row["DVR"] == "survives the severest (0 of 5 trials failed, 0-52 %)"
+    assert row["IDR"].startswith("success rises with severity (mild: 4 of 5 trials failed")
 
 
 def test_what_did_not_end_ok_keeps_its_cell(tmp_path):

@@ -320,7 +320,7 @@ def test_rows_that_were_merged_have_the_suites_page_without_runs(tmp_path):
     page = Page(tmp_path / "both")
     shown = page.paper("suite")
     assert [row[0] for row in shown["rows"]] == ["Dist", "Mine"] and shown["chart"]["panels"]
-    assert "at 1 unit, 1 problem (1 scene)" in shown["caption"] and "The run ended" not in shown["caption"]
+    assert "at 1 unit: 1 problem of 1 scene" in shown["caption"] and "The run ended" not in shown["caption"]
     found = page.read("list", "renderers")
     assert found["problems"] == [["complete", "car test 0, 20 points", 1.0]]
     dist, own, by_itself = found["rows"]

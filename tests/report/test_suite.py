@@ -344,7 +344,7 @@ def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alon
     data = "".join(path.read_text() for path in (own / "page" / "data").rglob("*.js"))
     assert "Mine" in data and "Dist" in data  # the page, too, is of the table that was written
     table = (own / "paper" / "suite.md").read_text()
-    assert "| Dist |" in table and "| Mine |" in table and "at 1 unit, 1 problem (1 scene)" in table
+    assert "| Dist |" in table and "| Mine |" in table and "at 1 unit: 1 problem of 1 scene" in table
     assert "1 scene cannot decide between 2 renderers" in table
     assert [one.row for one in read_attempts(own)[0]] == ["Mine"]
 
@@ -555,7 +555,7 @@ def test_a_budget_with_only_some_of_the_sets_names_them(tmp_path, monkeypatch):
     answer = study.verdict(shown)
     assert "At 1 unit, B" in answer and "At 10 units (complete), B" in answer
     caption = study._sample(shown)
-    assert "at 1 unit, 20 problems (10 scenes)" in caption and "at 10 units (complete), 10 problems" in caption
+    assert "at 1 unit: 20 problems of 10 scenes" in caption and "at 10 units (complete): 10 problems" in caption
 
 
 def test_without_anything_to_compare_both_pages_are_empty(tmp_path, monkeypatch):
