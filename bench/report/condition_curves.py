@@ -16,8 +16,9 @@ from bench.report.write.table import Column, ends, text
 
 SHAPE = ["family", "solid", "seed"]
 NOTE = (
-    "Values are medians over shapes, with intervals of the sign test. A ratio compares the same shapes. The verdict's "
-    "significance is by the sign test with Holm's correction over all its ratios."
+    "Values are medians over shapes. The figure and the CSV have intervals of the sign test. A ratio is the median of "
+    "the ratios on the same shapes, not the ratio of medians. The verdict's significance is by the sign test with "
+    "Holm's correction over all its ratios."
 )
 Line = dict[str, Any]
 
@@ -69,7 +70,7 @@ class ConditionCurves:
         runs = runs.executed
         values = runs.number(f"config.{self.condition}").fillna(self.absent)
         metrics = {each.key: each.factor * runs.number(each.key).fillna(each.failed) for each in self.measures}
-        frame = runs.frame[[*SHAPE, "row", "preset"]].assign(
+        frame = runs.frame[[*SHAPE, "row", "preset", "status"]].assign(
             value=values, cost=runs.number("evaluations_cost"), **metrics
         )
         lines = self._lines(frame)
@@ -95,6 +96,7 @@ class ConditionCurves:
             *(Column("ratio", f"Ratio to that at {self.first:g}"), *ends("ratio", lambda line: line["gain"])),
             *(Column(each.key, each.heading) for each in self.measures[1:]),
             Column("cost", "Field evaluations"),
+            text("failed", "Not ok"),
         )
 
     def _lines(self, frame: pd.DataFrame) -> list[Line]:
@@ -110,6 +112,7 @@ class ConditionCurves:
                         **{key: estimate.value for key, estimate in estimates.items()},
                         **{"estimates": estimates, "ratio": gain and gain.value, "gain": gain},
                         "cost": format.number(group.cost.median()),
+                        "failed": f"{(group.status != 'ok').sum()} of {len(group)}",
                     }
                 )
         return lines
@@ -142,7 +145,7 @@ class ConditionCurves:
         parts = [f"{name} *{format.number(ratios[name].value)}*" for name in differ]
         if len(differ) < len(ratios):
             undecided = statistics.Verdict.NOT_DECIDABLE in verdicts.values()
-            reason = "too few shapes" if undecided else "no significant difference from 1"
+            reason = "too few shapes" if undecided else "not significantly different from 1"
             if differ:
                 parts.append(f"{format.plural(len(ratios) - len(differ), 'other row')}: {reason}")
             else:

@@ -22,10 +22,11 @@ NOTES = (
     "Ratios compare each row with the same renderer at full effort: all pixels in each of 100 iterations, and the "
     "default epsilon. They are medians over shapes; a failed run has the largest error of all rows on its shape.",
     "A row at full effort has no ratios. An error ratio below 1 is better; after it stands the number of shapes on "
-    "which the row is better.",
+    "which the row is better. An interval that contains 1 does not show that errors are equal.",
     "`effort=needed` holds out a tenth of the pixels. Each iteration compares a random pixel of blocks of 4 x 4 "
     "pixels, then of 2 x 2, then all others: the next when the loss of the held-out pixels stops falling. The last ten "
-    "iterations compare all pixels. The true shape is not used. Epsilon, where a renderer has it, is half a pixel.",
+    "iterations compare all pixels. The true shape is not used. DIST and IDR have an epsilon of half a pixel, "
+    "Newton has none.",
     "Two rows test each part alone: `epsilon=auto`, and `effort=needed` with the default epsilon.",
     "Field evaluations: a gradient counts as two. Those of the held-out pixels are included.",
 )
@@ -64,7 +65,8 @@ def _lines(compared: compare.Compared, costs: Any) -> list[Line]:
         for preset in presets:
             full = FULL.get(preset)
             gap = compared.gap(family, rows[preset], rows[full]) if full in rows else None
-            ratio = (shown[preset] / shown[full]).median() if full in shown and preset in shown else None
+            both = shown[[preset, full]].dropna() if full in shown and preset in shown else shown[:0]
+            ratio = statistics.ratio(*(_shapes(both[name]) for name in (preset, full))) if len(both) else None
             cost = shown[preset].median() if preset in shown else None
             line = everywhere[preset]
             name = NAMES.get(preset, line["row"])
@@ -75,25 +77,35 @@ def _lines(compared: compare.Compared, costs: Any) -> list[Line]:
 def _verdict(lines: list[Line]) -> str:
     """The ratios of costs and errors for the rows of `HEADLINE`, and which errors differ significantly."""
     pooled = {line["preset"]: line for line in lines if line["family"] == lines[0]["family"]}
-    shown = [pooled[preset] for preset in HEADLINE if preset in pooled and pooled[preset]["ratio"]]
-    ratios = [line["ratio"].ratio for line in shown]
-    differ = [
-        line["row"]
-        for line, verdict in zip(shown, statistics.ratio_verdicts(ratios), strict=True)
-        if verdict is statistics.Verdict.DIFFERS
+    tested = [line for line in pooled.values() if line["ratio"] and line["cost_ratio"]]
+    ratios = [line["ratio"].ratio for line in tested]
+    verdicts = zip(tested, statistics.ratio_verdicts(ratios), strict=True)
+    differ = [line["row"] for line, verdict in verdicts if verdict is statistics.Verdict.DIFFERS]
+    parts = [
+        f"{line['row']}: cost *{format.number(line['cost_ratio'].value)}×*, error {line['ratio'].ratio}"
+        for line in tested
+        if line["preset"] in HEADLINE
     ]
-    parts = [f"{line['row']} *{format.number(line['cost_ratio'])}* and {line['ratio'].ratio}" for line in shown]
-    test = f"{', '.join(differ)} differ significantly in error" if differ else "No error differs significantly"
-    sample = f"n = {len(ratios[0].points)} shapes" if ratios else ""
-    return f"Cost and error relative to full effort: {'; '.join(parts)}. {test} ({sample})." if shown else ""
+    few = f"{len(differ)} of {len(tested)} errors differ significantly: {', '.join(differ)}"
+    test = few if differ else f"None of {len(tested)} errors differs significantly"
+    return f"Relative to full effort: {'; '.join(parts)}. {test} (n = {len(ratios[0].points)} shapes)." if parts else ""
 
 
 def _panel(lines: list[Line]) -> chart.Panel:
     """Error ratio over cost ratio: a point per row, and the renderers at full effort at 1 and 1."""
     drawn = [line for line in lines if line["ratio"] and line["cost_ratio"]]
-    points = [chart.series(each["row"], each["preset"], [each["cost_ratio"]], [each["ratio"].ratio]) for each in drawn]
-    level = chart.level("full effort", [0, 1], 1.0)
-    return chart.panel_data("", "cost relative to full effort", "error relative to full effort", [level, *points])
+    points = [
+        chart.series(each["row"], each["preset"], [each["cost_ratio"].value], [each["ratio"].ratio]) for each in drawn
+    ]
+    full = chart.series("full effort", "", [1.0], [1.0], symbol="o") | {"colour": chart.REFERENCE_COLOUR}
+    equal = chart.level("equal error", [0, 1], 1.0, quiet=True)
+    cost, error = (f"{name}, relative to the same renderer at full effort" for name in ("field evaluations", "error"))
+    return chart.panel_data("", cost, error, [equal, full, *points])
+
+
+def _shapes(costs: Any) -> list[Any]:
+    """A group per shape, for `statistics`."""
+    return [group.to_numpy() for _, group in costs.groupby(level=["family", "solid"])]
 
 
 COLUMNS = (
@@ -101,7 +113,7 @@ COLUMNS = (
     *table.estimate("error", "Chamfer × 1000"),
     table.text("ratio", "Error ratio", lambda line: "" if line["ratio"] is None else str(line["ratio"])),
     *table.ends("ratio", lambda line: compare.ratio_of(line["ratio"])),
-    *table.columns(lambda value: "" if value is None else format.number(value), cost_ratio="Cost ratio"),
+    table.text("cost_ratio", "Cost ratio", lambda line: "" if line["cost_ratio"] is None else str(line["cost_ratio"])),
     *table.columns(format.count, cost="Field evaluations"),
     *table.columns(table.word, failed="Failed", preset=""),
 )

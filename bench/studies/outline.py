@@ -16,7 +16,9 @@ NOTES = (
     "compare single rays: in a pixel of which a fraction k of n rays is covered, k rays should hit. Rays that hit come "
     "first, in random order, and then the rays nearest to the surface.",
     "With 1 ray, it goes through the centre of each pixel. With 4 and 16, each iteration draws a random ray in each of "
-    "2 x 2 or 4 x 4 squares of the pixel. All rows have 60 iterations, so four times the rays cost four times as much.",
+    "2 x 2 or 4 x 4 squares of the pixel. All rows have 60 iterations, so four times the rays cost four to five times "
+    "as much. Runs with 16 rays are of eight of the twelve shapes.",
+    "A run that is not ok ended with no smaller loss than at its start (`not_reached`). Its result counts.",
     "With 1 ray, a pixel's observation is its mask at the centre. With several, it is the covered fraction. Rows with "
     "mask or fraction in their name keep that observation for any number of rays. The figure leaves them out.",
 )
@@ -53,10 +55,10 @@ def make(runs: Runs) -> Result:
     parts = []
     if stuck is not None:
         start, end = (format.number(x) for x in (runs.number("start_area_error").median(), stuck["area_error"]))
-        parts.append(f"With 1 ray, the relaxed boundary ends at {end} pixels, from {start}.")
+        parts.append(f"With 1 ray, the relaxed boundary does not improve ({start} to {end} pixels).")
     if centres is not None and centres["ratio"] is not None:
         ratio = format.number(centres["ratio"])
-        parts.append(f"NeuS with 4 rays and masks in place of covered fractions: {ratio}.")
+        parts.append(f"NeuS with masks, not fractions: {ratio}.")
     return replace(result, verdict=" ".join([result.verdict, *parts]) if result.verdict else "")
 
 

@@ -38,9 +38,10 @@ NOTES = (
     "of the least error is as good as the best: it suffices for the scene, as far as these candidates show.",
     "A field that was checked on further views is chosen only if it suffices on {held:.0f} % or more of random draws "
     "of these. Unchecked: the run has no such draws of this field.",
-    "`field=auto` recommends the field with the fewest numbers under half a pixel. Evaluations at pixel precision are "
-    "those of a second fit of it, over those of the first. The second fit has renderer.epsilon=auto, "
-    "renderer.steps=auto and rays that follow the loss.",
+    "Numbers are those that a field stores. Of a grid, only those near the surface are trained: `free` in the CSV.",
+    "The field with the fewest numbers under half a pixel, checked or not, is fitted again at pixel precision: with "
+    "renderer.epsilon=auto, renderer.steps=auto and rays that follow the loss. The table has the evaluations relative "
+    "to its first fit, and the error.",
 )
 POINT = (
     "The larger a marker, the more numbers its field stores. Hollow markers: the last round still reduced the error. "
@@ -203,7 +204,7 @@ def draw(panels: list[chart.Panel], labels: list[Labels]) -> Figure:
             axis.annotate(label, (x, y), (0, -14), textcoords="offset points", ha="center", fontsize=6.5)
         axis.margins(y=0.16)
     axis = figure.axes[0]
-    axis.plot([], [], "p", mfc="none", color="#666666", label="hollow: error still fell")
+    axis.plot([], [], KINDS["network"][2], mfc="none", color=KINDS["network"][1], label="hollow: error still fell")
     for stored in MARKER_EXAMPLES:
         axis.plot([], [], "o", ms=marker_points(stored), color="#bbbbbb", label=f"{stored:,} numbers")
     figure_style.legend_below(figure, *figure.axes, columns=4)
@@ -234,9 +235,10 @@ def _best(line: Line) -> str:
     return f"{best.label}: {best.numbers['stored']:,} numbers, {error} ± {spread}"
 
 
-def _factor(x: float | None) -> str:
-    """A ratio as text, such as 0.43×."""
-    return format.MISSING if x is None else f"{format.number(x)}×"
+def _at_pixel_precision(line: Line) -> str:
+    """The evaluations of the second fit relative to the first, and its error, such as 0.43×, 12.5."""
+    ratio = line.get("frugal_evaluations")
+    return format.MISSING if ratio is None else f"{format.number(ratio)}×, {table.thousandfold(line['frugal.error'])}"
 
 
 SIZES = ("stored", "free", "bytes")
@@ -253,7 +255,7 @@ CANDIDATES = (  # a line is a run and a candidate
 COLUMNS = (  # a line is a run
     SCENE[0],
     PIXELS,
-    table.Column("footprint", "Half a pixel × 1000", show=table.thousandfold),
+    table.Column("footprint", "Half a pixel (scene units × 1000)", show=table.thousandfold),
     *(
         table.shown(f"F{heading[1:]}, error × 1000", lambda line, choice=choice: _chosen(line, choice))
         for choice, (_, _, heading, *_) in CHOICES.items()
@@ -261,7 +263,8 @@ COLUMNS = (  # a line is a run
     table.shown("Least error × 1000", _best),
     table.text("stopped", "Error still fell"),
     *table.raw("auto.overhead"),
-    *table.columns(_factor, frugal_evaluations="Evaluations at pixel precision"),
+    table.Column("frugal_evaluations", "At pixel precision: evaluations, error × 1000", words=_at_pixel_precision),
+    *table.raw("frugal.error"),
     table.text("lost", "Failed candidates"),
 )
 PAGES = {"parsimony": make}

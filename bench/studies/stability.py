@@ -48,7 +48,9 @@ NOTES = (
     "it has spurious hits of more than 1 %. A gradient fails below a cosine of 0.99, or if its length is 10 % off. A "
     "fit fails if the error of its surface is above 0.02 scene units.",
     "A breakdown is the severity at which half of the trials fail, as a percentage of the axis: 0 % is the mildest "
-    "severity, 100 % the severest. In brackets: its interval, or the failed trials at that end of the axis.",
+    "severity, 100 % the severest. In brackets: its interval, or the failed trials at that end of the axis. A renderer "
+    "survives if its breakdown lies beyond the severest severity, even if a few trials fail there.",
+    "A renderer that refuses a field ranks last on that axis. Rows without fits have breakdowns of renderings only.",
     "“Breaks first” and “Then” are the axes with the lowest breakdowns. Among equal ones, the axis on which the median "
     "renderer survives most is shown. “Best on” is the axis on which the renderer is farthest above the median "
     "renderer. Settings of renderers are left out.",
@@ -71,7 +73,7 @@ def make(runs: Runs) -> Result:
     compared = compared.assign(median=compared["axis"].map(medians))
     lines = [_extremes_of(compared[compared["row"] == row]) | {"row": row, "rank": ranks[row]} for row in rows]
     return Result(
-        runs,
+        runs.where(cells["row"].isin(rows)),
         "What breaks each renderer first.",
         "Per renderer and axis (kind of stress), the severity at which half of the trials succeed.",
         question="What breaks each renderer first?",
@@ -300,11 +302,7 @@ def _hardest_axis(cells: pd.DataFrame) -> str:
     hardest = [str(axis) for axis in counts.index[counts == counts.iloc[0]]]
     names = " and ".join(map(breakdowns.title, hardest))
     shares = " and ".join(f"*{counts.iloc[0]} of {(cells['axis'] == axis).sum()}*" for axis in hardest)
-    verb, whose = ("is", "its") if len(hardest) == 1 else ("are", "their")
-    return (
-        f"Of {cells['axis'].nunique()} axes, {names} {verb} the hardest: at {whose} mildest severity, {shares} tested "
-        "renderers break."
-    )
+    return f"Of {cells['axis'].nunique()} axes, most renderers break on {names}: {shares} at the mildest severity."
 
 
 PAGES = {"stability": make}

@@ -77,7 +77,8 @@ def make(*several: Runs | None) -> Result:
         replace(runs, records=[], left_out=Counter()),  # kept attempts count even if their run folders are gone
         "The suite.",
         "Progress of each renderer from the initial to the best possible error, at equal costs; in brackets, its "
-        "possible ranks. Each budget has its own runs, so a renderer has a line per budget. A cross: all runs failed.",
+        "possible ranks. Each budget has its own runs, so a renderer has a line per budget. A cross: all runs failed. "
+        "A dash: no rank.",
         question="Which renderer makes the most progress, at the same cost?",
         verdict=verdict(made),
         n=_sample(made),
@@ -255,13 +256,14 @@ def _fractions(axis: Axes, panel: chart.Panel) -> None:
     axis.set(xscale="log", xlim=(min(costs, default=0.1), max(costs, default=10.0)), ylim=(0, 1))
     axis.minorticks_off()
     axis.xaxis.set_major_formatter(lambda cost, _: f"{cost:g}")
-    axis.set_yticks([0, 0.25, 0.5, 0.75, 1], ["initial error", "25 %", "50 %", "75 %", "best possible"])
+    axis.set_yticks([0, 0.25, 0.5, 0.75, 1], ["initial, 0 %", "25 %", "50 %", "75 %", "best, 100 %"])
 
 
 def _ranks(axis: Axes, title: str, rows: Mapping[str, str], lines: Sequence[chart.Series], *, named: bool) -> None:
     """Draws the ranks that each row can have as a bar."""
     for number, line in enumerate(lines):
         if line["name"] not in rows:
+            axis.text(0.7, number, "–", color=line["colour"], va="center_baseline")
             continue
         ends = [int(rank) for rank in rows[line["name"]].split("–")]
         low, high = ends[0], ends[-1]
@@ -351,11 +353,15 @@ def _notes(made: Standing) -> list[str]:
     for budget, ranked in made.rankings.items():
         at_budget = runs[runs["budget"] == budget]
         least = f"The smallest p is {ranked.least_p:.2g}; the first pair needs {ALPHA / max(ranked.pairs, 1):.2g}"
-        possible = f"{ranked.possible_p:.2g} is possible with {format.plural(ranked.scenes, 'scene')}"
+        possible = f"the tested sign flips of {format.plural(ranked.scenes, 'scene')} allow {ranked.possible_p:.2g}"
         pairs = f"{len(ranked.better)} of {ranked.pairs} pairs differ significantly"
         if ranked.level > MAX_LEVEL:
             pairs = f"no pair counts as significant, since {percent(ranked.level)} of simulated draws have a false pair"
         notes.append(f"At {units(budget)}, {pairs}. {least}; {possible}.")
+        for name, group in at_budget.groupby("set"):
+            count, total = (len(each["problem"].unique()) for each in (group, runs[runs["set"] == name]))
+            if count < total:
+                notes.append(f"At {units(budget)}, {name} has {count} of its {total} problems.")
         further = at_budget[at_budget["ok"] & (at_budget["final"] > at_budget["initial"])]
         counts = further.groupby("set").size() / at_budget[at_budget["ok"]].groupby("set").size()
         for name, fraction in counts[counts > MENTIONED_FRACTION_OF_LARGER_ERRORS].items():

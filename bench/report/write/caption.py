@@ -54,9 +54,14 @@ def undefined(values: Iterable[float]) -> str:
     return "One shape and one seed are one draw: from it no probability and no rank is given (–)." if none else ""
 
 
-def warnings(runs: Runs) -> list[str]:
-    """Notes on differing settings, incomparable or doubtful times, and missing runs."""
-    timing = (_machines(runs), _loaded(runs)) if "machine" in runs.selection.setup else ()  # else it shows no times
+def warnings(runs: Runs, *, with_times: bool = True) -> list[str]:
+    """Notes on differing settings, incomparable or doubtful times, and missing runs.
+
+    Args:
+        with_times: whether the page has runtimes, or would have them on a machine without other load.
+    """
+    with_times = with_times and "machine" in runs.selection.setup
+    timing = (_machines(runs), _loaded(runs)) if with_times else ()
     notes = (_mixed(runs), *timing, _omitted(runs), _renamed(runs))
     return [note for note in notes if note]
 

@@ -131,7 +131,8 @@ class Result:
     @cached_property
     def notes(self) -> list[str]:
         remarks = [caption.fill_varying(self.runs, remark) for remark in self.remarks if remark]
-        return [*caption.warnings(self.runs), *remarks]
+        with_times = self.runs.timed or any(column.show is seconds for column in self.columns)
+        return [*caption.warnings(self.runs, with_times=with_times), *remarks]
 
     def shown(self, order: int = 0, experiments: Iterable[str] = ()) -> "Shown":
         """The content of the page as text. Pages are sorted by `order`; `experiments` are those that it reads."""
