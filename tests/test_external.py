@@ -107,6 +107,7 @@ def run_of(recipe: Path, code: Path, into: Path, *overrides: str) -> Record:
     return record
 
 
+@pytest.mark.slow
 def test_a_code_of_others_has_a_row_with_a_star_and_its_commit_in_the_table(code, tmp_path):
     results, recipe = f"results_dir={tmp_path}", code / "recipe.yaml"
     shared = ["scale=smoke", "dataset=photos", f"dataset.path={code}/photos", f"dataset.truth={code}/truth.ply"]

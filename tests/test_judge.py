@@ -69,6 +69,7 @@ def files(tmp_path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_spheres_and_plates_are_as_far_apart_as_they_were_made(files, capsys):
     # A nearest point is off the nearest surface point by half the spacing of 4,000 points: 0.06 for 4 pi 2^2.
     for name, distance, sampling_error in (("small", 0.2, 0.06), ("plate", 1.0, 0.08)):
@@ -80,6 +81,7 @@ def test_spheres_and_plates_are_as_far_apart_as_they_were_made(files, capsys):
         assert metrics["chamfer_l2"] == pytest.approx(2 * metrics["chamfer_gt_to_pred"], rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_threshold_is_in_units_or_per_cent_of_the_truths_extent(files, capsys):
     texts = ("0.999", "1.1", "1.005", f"{100.5 / 200**0.5}%")
     commands = [(*pair(files, "plate"), f"--threshold={text}") for text in (*texts, "0", "-1", "x", "1%%")]

@@ -164,7 +164,7 @@ def test_a_mistake_is_named_and_other_faults_have_no_name(mistake, seed):
 
 @DRAWS
 @given(seed=st.integers(0, 10**6))
-@pytest.mark.parametrize("write", [idr, nerf])
+@pytest.mark.parametrize("write", [pytest.param(idr, marks=pytest.mark.slow), nerf])
 def test_a_capture_with_a_mistake_is_refused_with_its_name(tmp_path, write, seed):
     views = seen(seed)
     write(tmp_path, views)

@@ -40,6 +40,7 @@ def solid() -> Mesh:
 POINTS = samples_of(solid())
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(st.integers(0, 47), st.sampled_from(sorted(FACTORS)), st.sampled_from([0.0, 4.0]), st.booleans())
 def test_the_change_that_was_made_is_undone(rank, factor, shift, is_partial):
@@ -65,6 +66,7 @@ def test_there_are_24_rotations_and_24_mirrors_and_the_commonest_is_first():
     assert all("about x (z up against y up?)" in str(Change(turns()[i], 1.0, np.zeros(3))) for i in (1, 2))
 
 
+@pytest.mark.slow
 @each("spoil", [
     lambda p: p + 0.05 * np.random.default_rng(1).normal(size=p.shape), lambda p: p[p[:, 0] > 0], lambda p: 0.8 * p,
     lambda p: 0.6 * p / np.linalg.norm(p, axis=1, keepdims=True), lambda p: p + 0.1, lambda p: p * (1, 1, 0.6),

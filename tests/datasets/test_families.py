@@ -57,6 +57,7 @@ def test_draws_fill_their_ranges_and_no_two_are_alike(family):
         assert high >= values.max() > high - 0.05 * (high - low) and len(np.unique(values)) == len(drawn)
 
 
+@pytest.mark.slow
 @by_family
 def test_each_parameter_changes_the_shape(family):
     points = torch.empty(50_000, 3).uniform_(-1.2, 1.2, generator=torch.Generator().manual_seed(0))

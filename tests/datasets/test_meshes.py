@@ -181,6 +181,7 @@ def test_functions_that_need_pymeshlab_name_it_if_it_is_missing(monkeypatch):
             call()
 
 
+@pytest.mark.slow
 def test_a_sheet_is_wrapped_closely_with_a_note_and_a_warning():
     thin = sheet(lambda x: 0.1 * np.sin(9 * x))
     mesh = repair(replace(thin, vertices=0.01 * thin.vertices))  # tolerances are fractions of the diagonal

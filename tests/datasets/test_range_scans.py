@@ -168,6 +168,7 @@ def handled(ball: trimesh.Trimesh, first: int, second: int) -> Mesh:
     return Mesh(ball.vertices, np.concatenate([np.delete(ball.faces, [first, second], axis=0), tube]))
 
 
+@pytest.mark.slow
 def test_a_scan_with_a_one_sided_tube_keeps_its_surface():
     ball = trimesh.creation.icosphere(5)
     near = np.argsort(np.linalg.norm(ball.triangles_center - ball.triangles_center[0], axis=1))[31]

@@ -208,6 +208,7 @@ def test_an_error_names_its_cause(folder, tmp_path, mesh, name, content, words):
         metrics_of(mesh, copy, TanksSettings(copy / "own.log", refine=False))
 
 
+@pytest.mark.slow
 def test_the_command_judges_writes_a_picture_and_refuses_what_does_not_fit(folder, mesh, tmp_path, capsys):
     mesh.save(tmp_path / "my barn.ply")
     command = [str(tmp_path / "my barn.ply"), "--tnt", str(folder.parent)]

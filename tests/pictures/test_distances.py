@@ -55,6 +55,7 @@ def test_a_view_is_upright_seen_from_above_and_not_mirrored(up):
     assert right @ up == pytest.approx(0, abs=1e-9) and down @ up < 0 and away @ up < 0
 
 
+@pytest.mark.slow
 def test_a_picture_is_grey_where_the_mesh_is_missing_and_its_curves_are_written(tmp_path):
     truth = icosphere(1.0, np.zeros(3), 5)
     lacking = np.where(truth.vertices[:, 2] > 0, 5.0, 0.01)

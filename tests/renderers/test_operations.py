@@ -3,6 +3,7 @@
 The limits are a few percent above the present numbers: a change that needs more must raise them here.
 """
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -45,6 +46,7 @@ def step(name: str, warm: int) -> Operations:
     return count
 
 
+@pytest.mark.slow
 @each("name", [*LIMITS])
 @each("warm", [0, 3])
 def test_a_step_takes_no_more_operations_and_waits_than_it_did(name, warm, monkeypatch):

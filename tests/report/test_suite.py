@@ -466,6 +466,7 @@ def test_the_shipped_page_is_that_of_the_shipped_rows(shipped_standing):
         }
 
 
+@pytest.mark.slow
 def test_equal_rows_differ_in_at_most_one_of_twenty_draws(shipped_standing):
     """The level of the shipped design at each budget: rows are centred in each set, and scenes are drawn anew."""
     decided = [budget for budget, ranked in shipped_standing.rankings.items() if ranked.decidable]

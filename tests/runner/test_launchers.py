@@ -124,6 +124,7 @@ def stopped(tmp_path: Path, number: signal.Signals) -> CommandResult:
         return running.send(number)
 
 
+@pytest.mark.slow
 def test_the_plan_is_written_before_the_first_cell_and_shows_what_was_not_run(tmp_path):
     assert stopped(tmp_path, signal.SIGKILL).code == -signal.SIGKILL
     cells = plan_of(tmp_path)["cells"]

@@ -113,6 +113,7 @@ def test_epsilon_auto_loses_no_hit_adds_at_most_one_percent_and_saves_a_tenth(na
         assert fewer <= 0.9 * values
 
 
+@pytest.mark.slow
 @each("family", FAMILIES)
 def test_epsilon_auto_holds_on_the_families(family):
     shape = formula(load("dataset", family))

@@ -172,6 +172,7 @@ def test_a_renderer_without_a_gradient_for_rays_has_no_camera_numbers(tmp_path):
     assert "oblique.code_cosine" in metrics and not [name for name in metrics if "camera" in name]
 
 
+@pytest.mark.slow
 def test_pixels_whose_hit_lies_on_another_surface_are_excluded_and_counted(tmp_path):
     metrics = judged(tmp_path, Changed(EXACT["idr"], EXACT["idr"].capabilities, 2.0)).record.metrics
     for band in HITS:

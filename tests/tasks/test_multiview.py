@@ -153,6 +153,7 @@ def test_an_encoder_is_trained_once_and_gives_the_code_about_which_starts_are_dr
     assert run.record.metrics_start["chamfer_l1"] < 0.6 * at_zero
 
 
+@pytest.mark.slow
 def test_a_misplaced_ball_is_put_back(scene):
     problem = problem_of(scene, shift=0.1, scale=1.1, degrees=5.0)
     first = problem.similarity.clone()

@@ -139,6 +139,7 @@ def final_loss(scene, seed: int, *, iterations: int = 60, **changed) -> float:
     return history.curve[-1]["total"]
 
 
+@pytest.mark.slow
 def test_restarts_find_what_one_start_misses(scene):
     """Judged by the loss: a box looks the same from four sides."""
     assert final_loss(scene, 2, starts=8, trial=4, iterations=90) < 0.1 < final_loss(scene, 2, iterations=40)

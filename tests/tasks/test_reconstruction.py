@@ -90,6 +90,7 @@ def assert_coloured_mesh(folder: Path) -> np.ndarray:
     return colours
 
 
+@pytest.mark.slow
 def test_a_rendered_mesh_is_learnt_with_its_colours(scene, tmp_path):
     record = executed(altered(run_in(tmp_path, scene), {"inputs.evaluation.every": 10}))
     assert (record.status, record.reason) == ("ok", "")
@@ -225,6 +226,7 @@ def folder(parent: Path, name: str) -> Path:
     return parent / name
 
 
+@pytest.mark.slow
 def test_auto_is_the_run_of_the_field_that_it_ends_on(scene, tmp_path):
     run = without_pictures(run_in(folder(tmp_path, "auto"), scene, field="auto"))
     record = executed(run)
@@ -239,6 +241,7 @@ def test_auto_is_the_run_of_the_field_that_it_ends_on(scene, tmp_path):
     assert named.metrics["psnr"] == record.metrics["psnr"] and named.evaluations == record.evaluations
 
 
+@pytest.mark.slow
 def test_the_fit_to_true_distances_is_better_than_a_short_reconstruction(scene, tmp_path):
     shared = {each.name: getattr(SETTINGS, each.name) for each in fields(Reconstruction)}
     shared["optimiser"] = OptimiserSettings(60, 0.01, "cosine")

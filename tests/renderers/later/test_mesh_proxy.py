@@ -96,6 +96,7 @@ def test_a_field_without_a_surface_has_no_mesh(value):
     assert rendering.distance.isfinite().all()
 
 
+@pytest.mark.slow
 def test_libraries_of_meshes_are_imported_at_the_first_use_only():
     result = by_program("-c", FIRST_USE)
     assert result.code == 0, result.err

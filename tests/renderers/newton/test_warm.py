@@ -74,6 +74,7 @@ def test_an_optimisation_has_the_hits_of_cold_renderings(warm, name):
     assert sum(values for _, values in renderings) < share * sum(values for _, values in in_turn(COLD, fields))
 
 
+@pytest.mark.slow
 def test_a_field_that_becomes_steep_loses_nothing(warm):
     rod = capsule((-0.5, 0.5, 0.0), (0.5, 0.5, 0.0), 0.03) | box((0.3, 0.01, 0.3))
     fields = [Shape(lambda p, k=k: k * rod(p)) for k in torch.linspace(1, 4, 48).tolist()]

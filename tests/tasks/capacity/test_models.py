@@ -278,6 +278,7 @@ def test_a_network_imitates_the_previous_field():
     assert alone.evidence.evaluations > network.evidence.evaluations  # this network fits a sphere first
 
 
+@pytest.mark.slow
 def test_growth_ends_on_a_sufficient_candidate():
     candidates = [candidate(name) for name in ("sphere", "box", "rounded_box", "network_1x16")]
     growth = grow(fitter_of("ball"), candidates, GROWTH)
@@ -433,6 +434,7 @@ def test_candidates_are_tried_in_the_order_of_the_measure():
         assert [tried.name for tried in by_size(names, measure)] == list(by_stored)
 
 
+@pytest.mark.slow
 def test_a_candidate_begins_from_the_best_and_an_unchanged_refit_equals_the_fit():
     fitter = fitter_of("box", iterations=6, warm_iterations=60)
     fits = list(fit_all(fitter, [candidate(name) for name in ("box", "sphere", "grid_8")]))
@@ -442,6 +444,7 @@ def test_a_candidate_begins_from_the_best_and_an_unchanged_refit_equals_the_fit(
     assert (second.mean, second.evaluations, second.flops) == (first.mean, first.evaluations, first.flops)
 
 
+@pytest.mark.slow
 @each("shape, name, rounds, falling", [("ball", "sphere", 6, False), ("capsule", "network_2x32", 2, True)])
 def test_a_fit_continues_while_its_error_falls_and_states_if_it_was_stopped(shape, name, rounds, falling):
     torch.manual_seed(0)

@@ -36,6 +36,7 @@ def test_a_background_has_finite_colours_on_all_rays(name):
         assert all(bool(p.grad.isfinite().all()) and bool((p.grad != 0).any()) for p in background.parameters())
 
 
+@pytest.mark.slow
 def test_a_learnt_background_fits_a_distant_texture():
     torch.manual_seed(0)
     background, wanted = OutsideSphere(), (RAYS.directions + 1) / 2

@@ -156,6 +156,7 @@ def test_a_step_over_more_shapes_has_no_larger_loss_and_gradient(images, rendere
     assert thrice == pytest.approx(once, rel=0.1) and other.norm() == pytest.approx(slope.norm().item(), rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_network_learns_from_the_visual_hull_which_sphere_an_image_shows(images, renderer, tmp_path):
     masks = replace(VOLUME, occupancy=0.0, hull=1.0)
     assert not masks.renders

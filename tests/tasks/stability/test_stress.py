@@ -171,6 +171,7 @@ MOVED = {
 }
 
 
+@pytest.mark.slow
 @each("name, severity", MOVED.items())
 def test_the_ground_truth_of_a_moved_surface_is_the_zero_of_the_disturbed_field(name, severity):
     before = {key: tensor.clone() for key, tensor in BALL.decoder.state_dict().items()}
@@ -238,6 +239,7 @@ def test_a_severity_may_be_a_setting_of_the_renderer():
     assert stress_named("gradient_samples").stressed(practical, 2.6).n_gradient_samples == 3
 
 
+@pytest.mark.slow
 @each("scene", ["depth_noise", "wrong_pose"])
 def test_a_disturbed_fit_ends_further_off(scene):
     renderer, few = load("renderer", "dist"), replace(conditions(), fit=replace(FIT, resolution=12, iterations=30))
