@@ -1,0 +1,35 @@
+"""Reconstruction from photographs whose exposures differ."""
+
+from bench.report.study import Runs, Selection, condition_curves
+
+PLACE = 49
+EXPOSURE = "task.images.exposure"
+READS = (Selection("exposure", (EXPOSURE,)),)
+NOTES = [
+    "The colours of each photograph, also of those held out, are multiplied by a random factor and limited to 1. The "
+    "logarithms of the factors have this standard deviation. Renderers do not know the factors.",
+    "Chamfer-L1 is over what photographs see.",
+]
+
+
+def notes(runs: Runs) -> list[str]:
+    """The notes."""
+    return NOTES
+
+
+PAGES = {
+    "exposure": condition_curves.ConditionCurves(
+        condition=EXPOSURE,
+        heading="Standard deviation of the log exposure",
+        first=0,
+        compared=0.3,
+        measures=(
+            condition_curves.Measure("seen_chamfer_l1", "Chamfer-L1 × 1000", 1e3),
+            condition_curves.Measure("mask_iou", "Overlap of masks", failed=0.0),
+        ),
+        title="Photographs of different exposures.",
+        question="Does a reconstruction break if the exposures of photographs differ?",
+        verdict="Chamfer-L1 with exposures that differ by 35 %, over that with equal exposures",
+        notes=notes,
+    )
+}
