@@ -380,7 +380,7 @@ def test_a_cell_of_the_atlas_opens_its_curve_and_its_run(results, tab):
     page = tab(results).open("#/table/stability")
     page.get_by_role("button", name="wires, dist: 0.1 (0.05 to 0.2)").click()
     page.locator(".opened .scatterlayer .trace").first.wait_for()
-    assert "Breaks: 0.1 (0.05 to 0.2). The run" in page.locator(".opened").inner_text()
+    assert "Breakdown: 0.1 (0.05 to 0.2). The run" in page.locator(".opened").inner_text()
     assert page.locator(".opened a").get_attribute("href") == "#/run/completion-0002"
     command = "python -m bench.ray task=stability stress=wires renderer=dist level=0.5"
     assert page.locator(".opened .code pre").all_text_contents() == [command]

@@ -70,7 +70,7 @@
     const isListed = run !== undefined;
     fill(opened,
       element("h2", null, `${axis.title}, ${row}`),
-      element("p", null, `Breaks: ${words(result)}. ${result.reason || ""} `,
+      element("p", null, `Breakdown: ${words(result)}. ${result.reason || ""} `,
         isListed ? element("a", {href: bench.runs.link(run)}, "The run") : soft("Its run is not among these results.")),
       rays(result.ray || {}),
       later(curves(), (panels) => {
