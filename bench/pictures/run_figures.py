@@ -140,16 +140,9 @@ def draw_against(path: Path, view: View, reference: View, *, title: str) -> None
 
 
 def save_images(folder: Path, view: View, true: View) -> None:
-    """Writes `folder/images.npz`: normals of both [h, w, 3], hits of both and the depth error [h, w]."""
-    arrays = {
-        "normals": picture_normals(view).half(),
-        "reference_normals": picture_normals(true).half(),
-        "hit": view.mask,
-        "reference_hit": true.mask,
-        "depth_error": torch.where(view.mask & true.mask, (view.depth - true.depth).abs(), torch.nan),
-    }
-    stored = {name: array.numpy() for name, array in arrays.items()}
-    np.savez_compressed(folder / "images.npz", **stored)  # type: ignore[arg-type]
+    """Writes `folder/images.npz`: normals [h, w, 3] and hits [h, w] of both."""
+    normals = {"normals": picture_normals(view), "reference_normals": picture_normals(true)}
+    save_arrays(folder, normals | {"hit": view.mask, "reference_hit": true.mask})
 
 
 def save_gallery(

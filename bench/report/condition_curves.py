@@ -121,7 +121,11 @@ class ConditionCurves:
         """The ratio of the first measure to that at the first value, on the common shapes; None without any."""
         common = group.index[:0] if first is None else group.index.intersection(first.index)
         key = self.measures[0].key
-        return statistics.ratio(*(_shapes(each.loc[common][key]) for each in (group, first))) if len(common) else None
+        return (
+            statistics.ratio(*(statistics.by_shape(each.loc[common][key]) for each in (group, first)))
+            if len(common)
+            else None
+        )
 
     def _over_first(self, lines: list[Line]) -> dict[str, statistics.Interval]:
         """The ratio of each row of the figure at the compared value to the row at the first value."""
@@ -175,10 +179,5 @@ def _whole(value: float) -> float | int:
     return int(value) if value == int(value) else value
 
 
-def _shapes(values: pd.Series) -> list[np.ndarray]:
-    """A group per shape, for `statistics`."""
-    return [group.to_numpy() for _, group in values.groupby(level=SHAPE[:2])]
-
-
 def _median(values: pd.Series) -> statistics.Interval:
-    return statistics.typical(_shapes(values))
+    return statistics.typical(statistics.by_shape(values))

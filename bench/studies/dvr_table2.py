@@ -4,12 +4,10 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-import pandas as pd
-
 from bench.records.published import DVR_TABLE2
 from bench.records.record import as_number
 from bench.report.data.records import CHAMFER_SCALE, Record, Row, grouped, row_of, setting
-from bench.report.study import Result, Runs, Selection, chart, curves, format, gallery, medians, style, table
+from bench.report.study import Result, Runs, Selection, format, gallery, medians, table
 from bench.report.suite.attempts import TUNED_PREFIX
 
 PLACE = 45
@@ -22,7 +20,6 @@ NOTES = (
     "Colours are compared at hits in held-out photographs. For volume renderers and the relaxed boundary, they are "
     "compared at all pixels of the mask, on black.",
     "Volume renderers use the cross entropy between opacity and mask, and a limited number of samples per ray.",
-    "The page `dvr_curves`, drawn from the folders of your runs, shows whether a row has converged.",
     "“Published” is DVR, Table 2: photographs of three scans of DTU, in mm. These numbers cannot be compared directly "
     "with the measured rows.",
 )
@@ -50,12 +47,6 @@ RUNS = (
 )
 PICTURE_COLUMNS = (table.FAMILY, *table.IDENTITY, *table.metrics(SEEN_ERROR, "psnr"))
 
-CURVE_COLUMNS = (
-    table.text("method", "Method"),
-    *table.columns(table.integer, iterations="Iterations", at="Checkpoint nearest to half"),
-    *table.columns(table.thousandfold, half="Error at this checkpoint", end="Error at the end"),
-    *table.columns(table.percent, fell="Decrease"),
-)
 MAX_SCENES = 2
 LOOKALIKES = {  # presets not shown in figures, because they look like another row
     *("rgb_dist", "rgb_idr", "rgb_naive", "rgb_relaxed_boundary", "rgb_volsdf", "rgb_unisurf"),
@@ -151,70 +142,6 @@ def _photograph_settings(runs: Runs) -> str:
     )
 
 
-def convergence(runs: Runs) -> Result:
-    """The error on the seen surface over the iterations, median over scenes; a level for rows without iterations."""
-    runs = runs.executed
-    ends = {Row(line["preset"], line["method"]): line[SEEN_ERROR] for line in medians.medians(runs, (SEEN_ERROR,))}
-    curves_by_row = {row: _error_curve(runs, records, ends[row]) for row, records in runs.rows().items()}
-    longest = max(curve.index[-1] for curve in curves_by_row.values())
-    levels = {row: pd.Series([curve[0]] * 2, [1, longest]) for row, curve in curves_by_row.items() if 0 in curve}
-    shown = curves_by_row | levels
-    drawn = [
-        chart.curve(row.name, row.preset, shown[row].index, style.finite(CHAMFER_SCALE * shown[row]))
-        for row in _distinct(runs)
-    ]
-    lines = [_fall(row, curve) for row, curve in curves_by_row.items() if row not in levels]
-    return Result(
-        runs,
-        "Error over the iterations on photographs.",
-        f"Median Chamfer-L1 of the seen surface over {_scenes(runs)}, at the checkpoint nearest to half of the "
-        "iterations and at the end; the figure has all checkpoints.",
-        question="Would more iterations reduce the error on photographs?",
-        verdict=table.extremes(
-            "Decrease of the error in the second half",
-            {line["method"]: line["fell"] for line in lines},
-            _scenes(runs),
-            show=table.percent,
-        ),
-        remarks=(
-            "With a low learning rate, the error decreases slowly even far from convergence.",
-            "The figure shows one of several rows with similar results. A row without iterations is a horizontal line.",
-        ),
-        data=pd.concat(
-            curve.rename(SEEN_ERROR).rename_axis("iteration").reset_index().assign(row=row.name)
-            for row, curve in curves_by_row.items()
-        ),
-        columns=CURVE_COLUMNS,
-        lines=lines,
-        figure=chart.draw([chart.panel_data("", "iteration", f"{SEEN_LABEL} (scene units)", drawn)], 3.6),
-    )
-
-
-def _error_curve(runs: Runs, records: list[Record], end: float | None) -> pd.Series:
-    """The error of a row by iteration, up to its end; only an error at 0 for rows without iterations."""
-    histories = [curves.read(runs.folder(record), ("iteration", "seconds", SEEN_ERROR))[0] for record in records]
-    medians = curves.median(histories, [record["status"] != "ok" for record in records], SEEN_ERROR)
-    medians = medians.set_index("iteration")["median"]
-    last = max(int(curve["iteration"].max()) + 1 for curve in histories if len(curve)) if len(medians) else 0
-    return pd.concat([medians[medians.index > 0], pd.Series({last: end}, dtype=float)])
-
-
-def _fall(row: Row, curve: pd.Series) -> dict[str, Any]:
-    """A row's line, with the relative fall of its error in the last half; nan if it is infinite or not measured."""
-    *earlier, last = curve.index
-    middle = min(earlier, key=lambda middle: abs(middle - last / 2), default=0)
-    near_half = 4 * abs(middle - last / 2) <= last
-    half, end = curve[middle] if near_half else math.nan, curve[last]
-    return {
-        "method": row.name,
-        "preset": row.preset,
-        "iterations": last,
-        **({"at": middle, "half": half} if near_half else {}),
-        "end": end,
-        "fell": 1 - end / half if 0 < half < math.inf and end < math.inf else math.nan,
-    }
-
-
 def figures(runs: Runs) -> Result:
     """The first scenes in pictures, without rows that look like another."""
     rows, by_scene = list(_distinct(runs)), grouped(runs.records, medians.scene_of)
@@ -250,4 +177,4 @@ def _block(name: str, rows: list[Row], record_of: dict[Row, Record], scene: gall
     )
 
 
-PAGES = {"dvr_table2": make, "dvr_curves": convergence, "dvr_figures": figures}
+PAGES = {"dvr_table2": make, "dvr_figures": figures}

@@ -66,7 +66,9 @@ def _lines(compared: compare.Compared, costs: Any) -> list[Line]:
             full = FULL.get(preset)
             gap = compared.gap(family, rows[preset], rows[full]) if full in rows else None
             both = shown[[preset, full]].dropna() if full in shown and preset in shown else shown[:0]
-            ratio = statistics.ratio(*(_shapes(both[name]) for name in (preset, full))) if len(both) else None
+            ratio = (
+                statistics.ratio(*(statistics.by_shape(both[name]) for name in (preset, full))) if len(both) else None
+            )
             cost = shown[preset].median() if preset in shown else None
             line = everywhere[preset]
             name = NAMES.get(preset, line["row"])
@@ -101,11 +103,6 @@ def _panel(lines: list[Line]) -> chart.Panel:
     equal = chart.level("equal error", [0, 1], 1.0, quiet=True)
     cost, error = (f"{name}, relative to the same renderer at full effort" for name in ("field evaluations", "error"))
     return chart.panel_data("", cost, error, [equal, full, *points])
-
-
-def _shapes(costs: Any) -> list[Any]:
-    """A group per shape, for `statistics`."""
-    return [group.to_numpy() for _, group in costs.groupby(level=["family", "solid"])]
 
 
 COLUMNS = (

@@ -10,7 +10,7 @@ from bench.report.medians import scene_of
 from bench.studies import dvr_table2
 from tests.looped import each
 from tests.report.test_report_galleries import cells, notes
-from tests.report.test_report_paper import page_of, told, write_lines, write_run
+from tests.report.test_report_paper import page_of, told, write_run
 
 NEWTON, IDR, NEUS, HULL, STEREO = "Newton, RGB", "IDR, RGB", "NeuS, RGB", "Visual hull", "Stereo, Poisson"
 POISSON = "Depth, Poisson"
@@ -49,55 +49,12 @@ def made(results, row, metrics, *, dataset="sofa", experiment="dvr_table2", seco
     )
 
 
-def curve(folder, name, values):
-    """Writes a run's curve, of one quantity."""
-    write_lines(folder, [{"iteration": n, "seconds": n / 10, name: value} for n, value in values.items()])
-
-
 def chosen(results, page=dvr_table2):
     return choose(read_records(results)[0], page.READS[0], results)
 
 
 def line_of(result, row):
     return result.table.set_index("Method").loc[row]
-
-
-def test_curves_are_medians_of_scenes_that_end_at_the_errors_of_the_table(tmp_path):
-    for scene, factor in (("sofa", 1), ("car", 3)):
-        folder = made(tmp_path, NEWTON, scored(0.01 * factor), dataset=scene)
-        curve(folder, "seen_chamfer_l1", {0: 0.05 * factor, 20: 0.03 * factor, 180: 0.02 * factor, 399: None})
-        made(tmp_path, HULL, scored(0.04 * factor), dataset=scene)
-    result = page_of(tmp_path, "dvr_curves")
-    of = {row: lines.set_index("iteration")["seen_chamfer_l1"].to_dict() for row, lines in result.data.groupby("row")}
-    assert of[NEWTON] == pytest.approx({20: 0.06, 180: 0.04, 400: 0.02}) and of[HULL] == pytest.approx({0: 0.08})
-    assert result.table.values.tolist() == [[NEWTON, "400", "180", "40.0", "20.0", "50 %"]]
-    assert "in the second half: *50 %* (Newton, RGB); n = 2 scenes." in result.verdict
-
-
-@pytest.mark.parametrize(
-    ("last", "curves", "expected"),
-    [
-        ("crashed", ({20: 0.03, 180: 0.02, 399: None}, {}), ["400", "180", "∞", "∞", "–"]),  # without a curve
-        ("diverged", ({20: 0.03, 180: 0.02, 399: None}, {0: 0.05, 30: None}), ["400", "180", "∞", "∞", "–"]),
-        ("diverged", ({0: 0.05},), ["1", "–", "–", "∞", "–"]),  # in its first iteration
-        ("diverged", ({20: 0.03, 130: 0.02, 250: None},), ["251", "130", "20.0", "∞", "–"]),
-        ("ok", ({0: 0.05, 399: 0.01},), ["400", "–", "–", "10.0", "–"]),  # without a checkpoint in the middle
-        (
-            "ok",
-            ({0: 0.05, 20: 0.03, 180: 0.02, 399: 0.01}, {0: 0.05, 20: 0.03, 99: None}),
-            ["400", "–", "–", "10.0", "–"],
-        ),
-    ],
-)
-def test_what_no_fall_is_known_of_is_missing_and_costs_no_page(tmp_path, last, curves, expected):
-    for place, values in enumerate(curves):
-        status = last if place == len(curves) - 1 else "ok"
-        folder = made(tmp_path, NEWTON, scored(0.01), dataset=("sofa", "car")[place], status=status)
-        if values:
-            curve(folder, "seen_chamfer_l1", values)
-    made(tmp_path, HULL, scored(0.05))
-    result = page_of(tmp_path, "dvr_curves")
-    assert result.table.values.tolist() == [[NEWTON, *expected]] and result.verdict == ""
 
 
 def test_a_note_on_equal_settings_is_that_of_the_records(tmp_path):

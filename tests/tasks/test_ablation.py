@@ -166,8 +166,6 @@ def test_the_images_are_those_of_the_renderer_and_of_the_reference(dist):
     images = np.load(dist.folder / "images.npz")
     hit, true, metrics = images["hit"], images["reference_hit"], dist.record.metrics
     assert true.sum() == metrics["hits"] and (true & ~hit).sum() == metrics["lost"]
-    assert (np.isfinite(images["depth_error"]) == (hit & true)).all()
-    assert np.nanmax(images["depth_error"]) == metrics["depth_error_max"]
     right, up, towards = images["reference_normals"].astype(float)[true].T
     rows, columns = np.nonzero(true)
     assert (towards > 0).all() and np.corrcoef(right, columns)[0, 1] > 0.9

@@ -188,6 +188,11 @@ def _sign_test_p_value(points: Sequence[float]) -> float:
     return min(1.0, 2 * float(special.bdtr(min(below, above), below + above, 0.5)))
 
 
+def by_shape(values: pd.Series) -> list[np.ndarray]:
+    """The groups of values whose index begins with the family and the shape."""
+    return [group.to_numpy() for _, group in values.groupby(level=[0, 1])]
+
+
 def _shape_means(groups: Groups) -> np.ndarray:
     return np.array([geometric_mean(flat([group])) for group in groups])
 
