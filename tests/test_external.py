@@ -107,6 +107,17 @@ def run_of(recipe: Path, code: Path, into: Path, *overrides: str) -> Record:
     return record
 
 
+def test_a_code_of_others_is_run_and_its_mesh_judged_in_the_cameras_world(code, tmp_path):
+    into = tmp_path / "run"
+    into.mkdir()
+    record = run_of(code / "recipe.yaml", code, into, f"dataset.truth={code}/truth.ply", "evaluation.points=3000")
+    assert record.status == "ok", record.reason
+    expected = (GROWN - 1) * RADIUS / SPHERE_RADIUS
+    assert record.metrics["chamfer_l1"] == pytest.approx(expected, abs=0.2 * expected)
+    distances = np.linalg.norm(read_mesh(into / "mesh_world.ply").vertices - CENTRE, axis=1)
+    assert distances == pytest.approx(GROWN * RADIUS, abs=0.02 * RADIUS)
+
+
 @pytest.mark.slow
 def test_a_code_of_others_has_a_row_with_a_star_and_its_commit_in_the_table(code, tmp_path):
     results, recipe = f"results_dir={tmp_path}", code / "recipe.yaml"

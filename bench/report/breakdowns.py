@@ -30,6 +30,11 @@ SEVERE_WORDS = {  # the severe case, for axes whose names do not say it
     "weak_distance": "distances too small", "wires": "thin wires",
 }  # fmt: skip
 ENDS = ("mild", "severe")
+SUCCESS = (
+    "Success: {hits:g} of the true hits lie within the footprint of a pixel, and spurious hits are at most "
+    "{false_hits:g} of them. A gradient has a cosine of at least {cosine:g} and a relative length within {scale:g} of "
+    "1. A fit is within {surface_error:g} scene units of the surface."
+)  # of a trial, by `criteria`
 TARGET = ("renderer", "_target_")
 NUMBERS = (
     *("level", "level_low", "level_high", "breakdown", "breakdown_low", "breakdown_high"),
@@ -63,6 +68,12 @@ def cells_of(runs: Runs) -> pd.DataFrame:
         full=[_breakdown_texts(cell, f" {cell.unit}")[1] for cell in cells.itertuples()],
         mark=[_mark(cell) for cell in cells.itertuples()],
     )
+
+
+def criteria(runs: Runs) -> dict[str, float]:
+    """The criteria of success of the runs, for `SUCCESS`."""
+    names, task = ("hits", "false_hits", "cosine", "scale", "surface_error"), runs.requested().get("task")
+    return {name: float(records.setting(task, "criteria", name) or math.nan) for name in names}
 
 
 def axes_of(cells: pd.DataFrame) -> pd.DataFrame:

@@ -1,5 +1,6 @@
 """`effort=needed`: no more rays, iterations and precision than a scene needs, against a fixed effort."""
 
+import math
 from typing import Any
 
 from bench.records import format
@@ -16,7 +17,10 @@ FULL = {  # each row, and the row of the same renderer with full effort
     "dist_60": "dist_all_pixels",
 }
 NAMES = {"newton_mask": "Newton, effort=full", "idr_mask": "IDR, effort=full"}
-HEADLINE = ("dist_needed", "newton_needed", "idr_needed", "dist_60")  # rows of the verdict
+HEADLINES = {  # the beginning of a sentence of the verdict, and its rows
+    "Relative to full effort, effort=needed": ("dist_needed", "newton_needed", "idr_needed"),
+    "60 iterations": ("dist_60",),
+}
 NOTES = (
     compare.ERROR,
     "Ratios compare each row with the same renderer at full effort: all pixels in each of 100 iterations, and the "
@@ -28,7 +32,8 @@ NOTES = (
     "iterations compare all pixels. The true shape is not used. DIST and IDR have an epsilon of half a pixel, "
     "Newton has none.",
     "Two rows test each part alone: `epsilon=auto`, and `effort=needed` with the default epsilon.",
-    "Field evaluations: a gradient counts as two. Those of the held-out pixels are included.",
+    "Field evaluations: a gradient counts as two. Those of the held-out pixels are included. Runs that did not end ok "
+    "have no cost.",
 )
 Line = dict[str, Any]
 
@@ -37,14 +42,15 @@ def make(runs: Runs) -> Result:
     """Errors and costs of completions relative to those of the same renderer at full effort."""
     compared = compare.Compared(runs, FULL["dist_needed"])
     frame = runs.frame.assign(cost=runs.number("evaluations_cost"))
-    lines = _lines(compared, frame[frame.status == "ok"].pivot_table("cost", ["family", "solid", "seed"], "preset"))
-    panel = _panel([line for line in lines if line["family"] == lines[0]["family"]])
+    lines = _lines(compared, frame[frame.status == "ok"].pivot_table("cost", ["family", "solid", "seed"], "row"))
+    pooled = [line for line in lines if line["family"] == lines[0]["family"]]
+    panel = _panel(pooled)
     return Result(
         runs,
         "Depth completion with no more effort than a scene needs.",
         "Error and field evaluations relative to the same renderer at full effort.",
         question="Does a completion need all pixels, 100 iterations and the default precision?",
-        verdict=_verdict(lines),
+        verdict=_verdict(pooled),
         interval=compare.INTERVAL,
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
@@ -56,48 +62,59 @@ def make(runs: Runs) -> Result:
 
 
 def _lines(compared: compare.Compared, costs: Any) -> list[Line]:
-    """A line per family and row, those over all families first; `costs` has a line per run and a column per preset."""
-    rows, lines = {row.preset: row for row in compared.rows}, []
-    presets = [each for each in (*dict.fromkeys(FULL.values()), *FULL) if each in rows]
+    """A line per family and row, those over all families first.
+
+    Args:
+        costs: a data frame with a line per run and a column per row.
+    """
+    order = [*dict.fromkeys(FULL.values()), *FULL]
+    rows = sorted(compared.rows, key=lambda row: order.index(row.preset) if row.preset in order else len(order))
+    of_preset, lines = {row.preset: row for row in rows}, []
+    line_of = {(line["family"], line["preset"], line["row"]): line for line in compared.lines}
     for family in dict.fromkeys(line["family"] for line in compared.lines):
-        everywhere = {line["preset"]: line for line in compared.lines if line["family"] == family}
         shown = costs if family == compare.ALL_FAMILIES else costs[costs.index.get_level_values("family") == family]
-        for preset in presets:
-            full = FULL.get(preset)
-            gap = compared.gap(family, rows[preset], rows[full]) if full in rows else None
-            both = shown[[preset, full]].dropna() if full in shown and preset in shown else shown[:0]
-            ratio = (
-                statistics.ratio(*(statistics.by_shape(both[name]) for name in (preset, full))) if len(both) else None
+        for row in rows:
+            full = of_preset.get(FULL.get(row.preset, ""))
+            cost = shown[row.name].median() if row.name in shown else math.nan
+            lines.append(
+                line_of[family, row.preset, row.name]
+                | {"row": NAMES.get(row.preset, row.name), "cost": None if math.isnan(cost) else cost}
+                | {"ratio": compared.gap(family, row, full) if full else None}
+                | {"cost_ratio": _cost_ratio(shown, row.name, full.name) if full else None}
             )
-            cost = shown[preset].median() if preset in shown else None
-            line = everywhere[preset]
-            name = NAMES.get(preset, line["row"])
-            lines.append(line | {"row": name, "ratio": gap, "cost": cost, "cost_ratio": ratio})
     return lines
 
 
-def _verdict(lines: list[Line]) -> str:
-    """The ratios of costs and errors for the rows of `HEADLINE`, and which errors differ significantly."""
-    pooled = {line["preset"]: line for line in lines if line["family"] == lines[0]["family"]}
-    tested = [line for line in pooled.values() if line["ratio"] and line["cost_ratio"]]
-    ratios = [line["ratio"].ratio for line in tested]
-    verdicts = zip(tested, statistics.ratio_verdicts(ratios), strict=True)
-    differ = [line["row"] for line, verdict in verdicts if verdict is statistics.Verdict.DIFFERS]
-    parts = [
-        f"{line['row']}: cost *{format.number(line['cost_ratio'].value)}×*, error {line['ratio'].ratio}"
-        for line in tested
-        if line["preset"] in HEADLINE
-    ]
-    few = f"{len(differ)} of {len(tested)} errors differ significantly: {', '.join(differ)}"
-    test = few if differ else f"None of {len(tested)} errors differs significantly"
-    return f"Relative to full effort: {'; '.join(parts)}. {test} (n = {len(ratios[0].points)} shapes)." if parts else ""
+def _cost_ratio(costs: Any, row: str, full: str) -> statistics.Interval | None:
+    """The ratio of two rows' costs on the shapes on which both ended ok; None without any."""
+    if not {row, full} <= {*costs}:
+        return None
+    both = costs[[row, full]].dropna()
+    return statistics.ratio(*(statistics.by_shape(both[name]) for name in (row, full))) if len(both) else None
 
 
-def _panel(lines: list[Line]) -> chart.Panel:
+def _verdict(pooled: list[Line]) -> str:
+    """The ratios of costs and errors for the rows of `HEADLINES`, and the errors that differ significantly."""
+    sentences = []
+    for beginning, presets in HEADLINES.items():
+        parts = [_costs(line) for line in pooled if line["preset"] in presets and line["ratio"]]
+        sentences += [f"{beginning}: {', '.join(parts)}."] if parts else []
+    ratios = [(line["row"], compare.ratio_of(line["ratio"])) for line in pooled]
+    return " ".join(filter(None, [*sentences, compare.differing(ratios, "of errors")]))
+
+
+def _costs(line: Line) -> str:
+    """A renderer with its ratios, such as DIST (cost 0.4×, error 1.01×)."""
+    cost = "no cost" if line["cost_ratio"] is None else f"{format.number(line['cost_ratio'].value)}×"
+    return f"{line['row'].partition(',')[0]} (cost *{cost}*, error {format.number(line['ratio'].ratio.value)}×)"
+
+
+def _panel(pooled: list[Line]) -> chart.Panel:
     """Error ratio over cost ratio: a point per row, and the renderers at full effort at 1 and 1."""
-    drawn = [line for line in lines if line["ratio"] and line["cost_ratio"]]
     points = [
-        chart.series(each["row"], each["preset"], [each["cost_ratio"].value], [each["ratio"].ratio]) for each in drawn
+        chart.series(line["row"], line["preset"], [line["cost_ratio"].value], [line["ratio"].ratio])
+        for line in pooled
+        if line["ratio"] and line["cost_ratio"]
     ]
     full = chart.series("full effort", "", [1.0], [1.0], symbol="o") | {"colour": chart.REFERENCE_COLOUR}
     equal = chart.level("equal error", [0, 1], 1.0, quiet=True)

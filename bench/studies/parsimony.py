@@ -39,9 +39,9 @@ NOTES = (
     "A field that was checked on further views is chosen only if it suffices on {held:.0f} % or more of random draws "
     "of these. Unchecked: the run has no such draws of this field.",
     "Numbers are those that a field stores. Of a grid, only those near the surface are trained: `free` in the CSV.",
-    "The field with the fewest numbers under half a pixel, checked or not, is fitted again at pixel precision: with "
+    "The field with the fewest numbers under half a pixel, confirmed or not, is fitted again at pixel precision: with "
     "renderer.epsilon=auto, renderer.steps=auto and rays that follow the loss. The table has the evaluations relative "
-    "to its first fit, and the error.",
+    "to its first fit, and the error. An exclamation mark: above half a pixel.",
 )
 POINT = (
     "The larger a marker, the more numbers its field stores. Hollow markers: the last round still reduced the error. "
@@ -236,9 +236,12 @@ def _best(line: Line) -> str:
 
 
 def _at_pixel_precision(line: Line) -> str:
-    """The evaluations of the second fit relative to the first, and its error, such as 0.43×, 12.5."""
-    ratio = line.get("frugal_evaluations")
-    return format.MISSING if ratio is None else f"{format.number(ratio)}×, {table.thousandfold(line['frugal.error'])}"
+    """The field, the evaluations of its second fit relative to the first, and its error, such as grid 32: 0.4×, 5."""
+    if (ratio := line.get("frugal_evaluations")) is None:
+        return format.MISSING
+    name, error, footprint = line["candidates"].chosen.label, line["frugal.error"], line["footprint"]
+    mark = "!" if error > footprint else ""
+    return f"{name}: {format.number(ratio)}×, {table.thousandfold(error)}{mark}"
 
 
 SIZES = ("stored", "free", "bytes")
@@ -247,6 +250,7 @@ PIXELS = table.Column("pixels", "Pixels", show=table.integer)
 CANDIDATES = (  # a line is a run and a candidate
     *SCENE,
     table.Column("pixels"),
+    *table.raw("auto.overhead", "frugal_evaluations", "frugal.error"),
     *table.raw("footprint", "chamfer_l2", "recommended_within", "recommended_enough", "held_out_seeds"),
     *table.raw("rung", "kind", "recommended", "best", *CHOICES),
     *table.raw(*SIZES, "sparse_bytes", FLOPS, "error", "standard_error", *COSTS, "iterations", "falling", "failed"),
@@ -262,9 +266,7 @@ COLUMNS = (  # a line is a run
     ),
     table.shown("Least error × 1000", _best),
     table.text("stopped", "Error still fell"),
-    *table.raw("auto.overhead"),
     table.Column("frugal_evaluations", "At pixel precision: evaluations, error × 1000", words=_at_pixel_precision),
-    *table.raw("frugal.error"),
     table.text("lost", "Failed candidates"),
 )
 PAGES = {"parsimony": make}

@@ -42,11 +42,10 @@ MARKS = {
     "": "not run",
 }
 GROUP_GAP_COLUMNS = 0.7
+MIN_EQUAL_AXES = 5  # with fewer, equal breakdowns may be chance
 LINE_INCHES, LABEL_INCHES = 0.155, 1.15  # the height of a renderer, and of the labels above the heat map
 NOTES = (
-    "A rendering fails if more than 1 % of its true hits are missed or farther off than the pixel's footprint, or if "
-    "it has spurious hits of more than 1 %. A gradient fails below a cosine of 0.99, or if its length is 10 % off. A "
-    "fit fails if the error of its surface is above 0.02 scene units.",
+    breakdowns.SUCCESS,
     "A breakdown is the severity at which half of the trials fail, as a percentage of the axis: 0 % is the mildest "
     "severity, 100 % the severest. In brackets: its interval, or the failed trials at that end of the axis. A renderer "
     "survives if its breakdown lies beyond the severest severity, even if a few trials fail there.",
@@ -71,6 +70,7 @@ def make(runs: Runs) -> Result:
     compared = ranked[ranked["is_measured"] & ~ranked["is_setting"] & ~ranked["rises"]]
     medians = compared.groupby("axis")["shade"].median()
     compared = compared.assign(median=compared["axis"].map(medians))
+    ranked_axes, equal = shared["axis"].nunique(), _equal_rows(shared)
     lines = [_extremes_of(compared[compared["row"] == row]) | {"row": row, "rank": ranks[row]} for row in rows]
     return Result(
         runs.where(cells["row"].isin(rows)),
@@ -80,7 +80,7 @@ def make(runs: Runs) -> Result:
         verdict=_hardest_axis(compared),
         n=f"{ranked['trials'].sum():.0f} trials in all, of {len(axes)} axes and {len(rows)} renderers",
         interval="95 % credible intervals of breakdowns",
-        remarks=[*(note.format(ranked_axes=shared["axis"].nunique()) for note in NOTES), *_equal_rows(shared)],
+        remarks=[*(note.format(**breakdowns.criteria(runs), ranked_axes=ranked_axes) for note in NOTES), *equal],
         data=_data(runs, cells, axes),
         columns=FIRST_COLUMNS,
         lines=lines,
@@ -282,27 +282,32 @@ FIRST_COLUMNS = (
 
 
 def _equal_rows(cells: pd.DataFrame) -> list[str]:
-    """A sentence on the renderers that break at the same severities on all axes of renderings, if there are any."""
-    groups: dict[tuple[float, ...], list[str]] = {}
-    for row, levels in cells.pivot(index="row", columns="axis", values="level").iterrows():
-        if levels.notna().all():
-            groups.setdefault(tuple(levels), []).append(str(row))
+    """Sentences on renderers with the same breakdowns inside the sweeps, `MIN_EQUAL_AXES` or more of them."""
+    inside = cells[cells["is_measured"] & cells["level"].between(0, 1, inclusive="neither")]
+    groups: dict[frozenset[tuple[str, float]], list[str]] = {}
+    for row, breakdowns_of_row in inside.groupby("row", sort=False):
+        pairs = zip(breakdowns_of_row["axis"], breakdowns_of_row["level"], strict=True)
+        groups.setdefault(frozenset(pairs), []).append(str(row))
     return [
-        f"{' and '.join(rows)} break at the same severities in all renderings."
-        for rows in groups.values()
-        if len(rows) > 1
+        f"Equal breakdowns in all renderings: {'; '.join(rows)}."
+        for pairs, rows in groups.items()
+        if len(rows) > 1 and len(pairs) >= MIN_EQUAL_AXES
     ]
 
 
 def _hardest_axis(cells: pd.DataFrame) -> str:
-    """A sentence on the axis on which most renderers break at the mildest severity; empty if none does."""
-    counts = cells[cells["at_once"]].groupby("axis").size().sort_values(ascending=False, kind="stable")
-    if counts.empty:
+    """A sentence on the axis that breaks the largest share of renderers at the mildest severity; empty if none does."""
+    counts = cells.groupby("axis")["at_once"].agg(["sum", "size"])
+    shares = (counts["sum"] / counts["size"]).sort_values(ascending=False, kind="stable")
+    if shares.empty or not shares.iloc[0] > 0:
         return ""
-    hardest = [str(axis) for axis in counts.index[counts == counts.iloc[0]]]
-    names = " and ".join(map(breakdowns.title, hardest))
-    shares = " and ".join(f"*{counts.iloc[0]} of {(cells['axis'] == axis).sum()}*" for axis in hardest)
-    return f"Of {cells['axis'].nunique()} axes, most renderers break on {names}: {shares} at the mildest severity."
+    hardest = [str(axis) for axis in shares.index[shares == shares.iloc[0]]]
+    broken = "; ".join(
+        f"{breakdowns.title(axis)} (*{counts.loc[axis, 'sum']} of {counts.loc[axis, 'size']}* renderers break)"
+        for axis in hardest
+    )
+    among = f"Of {len(shares)} axes, t" if len(shares) > 1 else "T"
+    return f"{among}he hardest at the mildest severity: {broken}."
 
 
 PAGES = {"stability": make}

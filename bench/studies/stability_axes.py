@@ -15,15 +15,13 @@ COST_AXES = ("field evaluations per ray at the mildest severity, median", "mean 
 AXES_NOTES = (
     "The adaptive search makes {share:.0f} % of the trials of a full grid. Every renderer gets the same trials at a "
     "severity. Renderings have {resolution}×{resolution} pixels.",
-    "“At once”: breaks at the mildest severity. “None”: does not break at the severest. Both have the failed trials "
-    "and the interval of their fraction (Clopper and Pearson). “–”: the renderer lacks that setting.",
-    "“Rises”: more trials succeed at the severest than at the mildest severity, so there is no breakdown. “One trial”: "
-    "repeats cannot differ, and the breakdown is between two neighbouring severities.",
+    "A renderer survives if its breakdown lies beyond the severest severity. Ends of the sweep have their failed "
+    "trials, with the interval of the probability (Clopper and Pearson). “–”: the renderer lacks that setting.",
+    "If success rises with severity, there is no breakdown. “One trial”: repeats cannot differ, and the breakdown is "
+    "between two neighbouring severities.",
     "If a disturbance moves the surface, the moved surface is the ground truth. The CSV of the page “stability” has "
     "the distance, and the kinds of failed trials.",
-    "Success: {hits:g} of the true hits lie within the footprint of a pixel, and spurious hits are at most "
-    "{false_hits:g} of them. A gradient has a cosine of at least {cosine:g} and a relative length within {scale:g} of "
-    "1. A fit is within {surface_error:g} scene units of the surface.",
+    breakdowns.SUCCESS,
 )
 COST_NOTES = (
     "An axis is a kind of stress. The axes are those of renderings, without settings that some renderer lacks. Rank 1 "
@@ -38,7 +36,6 @@ CURVE_NOTES = (
     "success rate (Clopper and Pearson).",
     "On the interactive page, a cell of the atlas opens the curves of its axis.",
 )
-CRITERIA = ("hits", "false_hits", "cosine", "scale", "surface_error")
 SHARE_COLUMNS = ("level", "severity", "successes", "trials", "share", "low", "high")
 COST_COLUMNS = (
     *(table.text("row", "Renderer"), table.Column("axes"), *table.estimate("rank", "Mean rank")),
@@ -53,7 +50,7 @@ def make_axes(runs: Runs) -> Result:
     cells = breakdowns.cells_of(runs)
     axes, rows = breakdowns.axes_of(cells), list(cells["row"].unique())
     task, trials = runs.requested().get("task"), cells["trials"].sum()
-    settings = {name: float(records.setting(task, "criteria", name) or math.nan) for name in CRITERIA}
+    settings: dict[str, Any] = {**breakdowns.criteria(runs)}
     settings["resolution"] = records.setting(task, "resolution")
     settings["share"] = 100 * trials / max(cells["grid_trials"].sum(), 1)
     words = breakdowns.grid(cells, axes, "words").fillna("").reset_index(drop=True)

@@ -51,7 +51,6 @@ def rows(plan: Plan) -> list[str]:
     return list(dict.fromkeys(cell.renderer for cell in plan.cells))
 
 
-@pytest.mark.slow
 def test_user_renderers_have_rows_in_an_experiment_that_compares_renderers(tmp_path, package):
     plan = swept("+experiment=stability", "stress=thin_plate", f"packages=[{package}]", folder=tmp_path / "conf")
     renderers = rows(plan)

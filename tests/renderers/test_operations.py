@@ -46,11 +46,11 @@ def step(name: str, warm: int) -> Operations:
     return count
 
 
-@pytest.mark.slow
-@each("name", [*LIMITS])
+@pytest.mark.parametrize("names", [["dist", "newton", "neus"], pytest.param([*LIMITS], marks=pytest.mark.slow)])
 @each("warm", [0, 3])
-def test_a_step_takes_no_more_operations_and_waits_than_it_did(name, warm, monkeypatch):
+def test_a_step_takes_no_more_operations_and_waits_than_it_did(names, warm, monkeypatch):
     monkeypatch.setitem(waits.COMPACTION_INTERVALS, "cpu", waits.DEFAULT_COMPACTION_INTERVAL)
-    most_operations, most_waits = LIMITS[name]
-    count = step(name, warm)
-    assert count.launches <= most_operations and count.waits.total() <= most_waits
+    for name in names:
+        most_operations, most_waits = LIMITS[name]
+        count = step(name, warm)
+        assert count.launches <= most_operations and count.waits.total() <= most_waits, name

@@ -126,7 +126,7 @@ def test_a_candidate_that_failed_is_counted_and_crossed_and_one_that_was_stopped
 
 def test_the_evaluations_at_pixel_precision_are_relative_to_the_first_fit(page, tmp_path):
     name = "At pixel precision: evaluations, error × 1000"
-    assert page.table.set_index("Scene").loc["box 0", name].startswith("0.250×, ")
+    assert page.table.set_index("Scene").loc["box 0", name].startswith("box: 0.250×, ")
     climbed(tmp_path, "car", {"sphere": 8, "box": 0.9}, needs="box", **{"frugal.error": ...})
     assert page_of(tmp_path, "parsimony").table[name].tolist() == ["–"]
 

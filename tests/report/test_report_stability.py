@@ -75,9 +75,22 @@ def test_a_renderer_has_the_axes_on_which_it_breaks_first_and_the_one_on_which_i
     assert rows.loc["DIST"].tolist()[:3] == [at_once, "fine bumps, 20 % [15, 25]", never]
     firsts = ["thin plate, 30 % [25, 35]", "fine bumps, 40 % [35, 45]"]
     assert rows.loc["DVR"].tolist()[:3] == [*firsts, "narrow gap, 50 % [45, 55]"]
-    assert "most renderers break on narrow gap: *1 of 2* at the mildest severity." in page.verdict
+    assert "the hardest at the mildest severity: narrow gap (*1 of 2* renderers break)." in page.verdict
     labels = [label.get_text() for label in page.figure.axes[0].get_xticklabels()]
     assert labels == ["large alpha", "narrow gap", "fine bumps", "thin plate", "thin wires"]
+
+
+def test_the_hardest_axis_breaks_the_largest_share_and_equal_breakdowns_inside_sweeps_are_named(tmp_path):
+    for renderer, level in (("DIST", 0.5), ("DVR", 0.5), ("IDR", 0.6)):
+        for index, axis in enumerate(("wires", "gap", "bumps", "thin_plate", "tiny_objects")):
+            broke(tmp_path, axis, renderer, level + index / 100)
+        broke(tmp_path, "nan_region", renderer, 1.1)
+    broke(tmp_path, "grazing_plane", "IDR", -0.1)
+    for renderer, level in (("DIST", -0.1), ("DVR", -0.1), ("IDR", 0.5)):
+        broke(tmp_path, "narrow_view", renderer, level)
+    page = page_of(tmp_path, "stability")
+    assert "Of 8 axes, the hardest at the mildest severity: grazing plane (*1 of 1* renderers break)." in page.verdict
+    assert "Equal breakdowns in all renderings: DIST; DVR." in page.notes
 
 
 def test_the_shipped_heat_map_has_a_line_per_renderer_and_marks_what_breaks_at_once(tmp_path):

@@ -49,7 +49,7 @@ def planned(experiment: str, at_most: int | None = None) -> list[tuple[tuple[str
     return found
 
 
-@pytest.mark.parametrize("at_most", [1, pytest.param(None, marks=pytest.mark.slow)])  # composing takes minutes
+@pytest.mark.parametrize("at_most", [2, pytest.param(None, marks=pytest.mark.slow)])  # composing takes minutes
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_the_command_of_a_page_plans_the_runs_that_it_shows(experiment: str, at_most: int | None):
     records = read_rows(SHIPPED / FOLDER, experiment)

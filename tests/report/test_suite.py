@@ -557,6 +557,10 @@ def test_a_budget_with_only_some_of_the_sets_names_them(tmp_path, monkeypatch):
     assert "At 1 unit, B" in answer and "At 10 units (complete), B" in answer
     caption = study._sample(shown)
     assert "at 1 unit: 20 problems of 10 scenes" in caption and "at 10 units (complete): 10 problems" in caption
+    half = [run for run in more if run.problem in sorted({run.problem for run in runs})[:5]]
+    shown = page([*runs, *others, *half], tmp_path / "half", monkeypatch)
+    fewer = [note for note in study._notes(shown) if note.startswith("At 10 units, complete has ")]
+    assert fewer == ["At 10 units, complete has 5 of its 10 problems."]
 
 
 def test_without_anything_to_compare_both_pages_are_empty(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Reconstruction from photographs on disk and of a mesh: it improves, leaves a coloured mesh, and tells mistakes."""
 
 import json
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -241,20 +242,20 @@ def test_auto_is_the_run_of_the_field_that_it_ends_on(scene, tmp_path):
     assert named.metrics["psnr"] == record.metrics["psnr"] and named.evaluations == record.evaluations
 
 
-@pytest.mark.slow
-def test_the_fit_to_true_distances_is_better_than_a_short_reconstruction(scene, tmp_path):
+@pytest.mark.parametrize("is_compared", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_fit_to_true_distances_is_better_than_a_short_reconstruction(scene, tmp_path, is_compared):
     shared = {each.name: getattr(SETTINGS, each.name) for each in fields(Reconstruction)}
     shared["optimiser"] = OptimiserSettings(60, 0.01, "cosine")
     settings = DistanceFit(**shared, distances=3000, batch=500, surface_width=0.05)
     errors = {}
-    for name, task in {"fit": settings, "photographs": SETTINGS}.items():
+    for name, task in {"fit": settings, **({"photographs": SETTINGS} if is_compared else {})}.items():
         (tmp_path / name).mkdir()
         run = altered(run_in(tmp_path / name, scene, field="network_2x16"), {"inputs.evaluation.points": 3000})
         task.execute(run)
         assert run.record.status == "ok"
         errors[name] = run.record.metrics["seen_chamfer_l1"]
         errors["start"] = run.record.metrics_start["seen_chamfer_l1"]
-    assert errors["fit"] < errors["photographs"] and errors["fit"] < 0.3 * errors["start"]
+    assert errors["fit"] < errors.get("photographs", math.inf) and errors["fit"] < 0.3 * errors["start"]
 
 
 def test_the_block_of_pixels_divides_the_rays(scene, tmp_path):

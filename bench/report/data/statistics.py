@@ -188,8 +188,8 @@ def _sign_test_p_value(points: Sequence[float]) -> float:
     return min(1.0, 2 * float(special.bdtr(min(below, above), below + above, 0.5)))
 
 
-def by_shape(values: pd.Series) -> list[np.ndarray]:
-    """The groups of values whose index begins with the family and the shape."""
+def by_shape(values: Any) -> list[np.ndarray]:
+    """The groups of a pandas series whose index begins with the family and the shape."""
     return [group.to_numpy() for _, group in values.groupby(level=[0, 1])]
 
 

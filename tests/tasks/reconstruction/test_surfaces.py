@@ -72,7 +72,6 @@ def test_points_of_a_sphere_give_a_sphere():
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)  # positive: wound outward
 
 
-@pytest.mark.slow
 def test_trimming_removes_what_no_point_supports():
     towards = directions(3000)
     upper = towards[towards[:, 2] > 0]
