@@ -91,7 +91,7 @@ class ConditionCurves:
     def _columns(self) -> tuple[Column, ...]:
         first = self.measures[0]
         return (
-            *(text("name", "Method"), Column("value", self.heading), Column("shapes", "Shapes")),
+            *(text("name", "Method"), Column("value", self.heading, show="{:g}".format), Column("shapes", "Shapes")),
             *(Column(first.key, first.heading), *ends(first.key, lambda line: line["estimates"][first.key])),
             *(Column("ratio", f"Ratio to that at {self.first:g}"), *ends("ratio", lambda line: line["gain"])),
             *(Column(each.key, each.heading) for each in self.measures[1:]),
@@ -171,7 +171,7 @@ class ConditionCurves:
             )
             for row, points in rows.items()
         ]
-        ticks = [format.number(value) for value in values]
+        ticks = [f"{value:g}" for value in values]
         return chart.panel_data("", self.heading.lower(), measure.heading, curves, ticks=ticks)
 
 

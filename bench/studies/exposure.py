@@ -8,7 +8,7 @@ READS = (Selection("exposure", (EXPOSURE,)),)
 NOTES = [
     "The colours of each photograph, also of those held out, are multiplied by a random factor and limited to 1. The "
     "logarithms of the factors have this standard deviation. Renderers do not know the factors.",
-    "Chamfer-L1 is over what photographs see.",
+    "Masks are given. Chamfer-L1 is over what photographs see.",
 ]
 
 
