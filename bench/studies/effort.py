@@ -118,8 +118,8 @@ def _panel(pooled: list[Line]) -> chart.Panel:
     ]
     full = chart.series("full effort", "", [1.0], [1.0], symbol="o") | {"colour": chart.REFERENCE_COLOUR}
     equal = chart.level("equal error", [0, 1], 1.0, quiet=True)
-    cost, error = (f"{name}, relative to the same renderer at full effort" for name in ("field evaluations", "error"))
-    return chart.panel_data("", cost, error, [equal, full, *points])
+    cost = "field evaluations, relative to the same renderer at full effort"
+    return chart.panel_data("", cost, "error, relative to full effort", [equal, full, *points])
 
 
 COLUMNS = (

@@ -149,12 +149,9 @@ def _lines(made: Standing) -> list[dict[str, Any]]:
             elif (budget, row) in made.cannot_run:
                 line[f"{budget:g}_rank"] = CANNOT_RUN
         counts = [CANNOT_RUN for _, name in made.cannot_run if name == row]
-        for (budget, name), group in runs.groupby(["budget", "set"]):
-            statuses = ", ".join(
-                f"{n} {status}" for status, n in group.loc[~group["ok"], "status"].value_counts().items()
-            )
-            if statuses:
-                counts.append(f"{(~group['ok']).sum()} of {len(group)} {name} at {units(budget)} ({statuses})")
+        for budget, group in runs.groupby("budget"):
+            if failed := (~group["ok"]).sum():
+                counts.append(f"{failed} of {len(group)} at {units(budget)}")
         lines.append(line | {"failed": "; ".join(counts)})
     return lines
 
