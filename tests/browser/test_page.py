@@ -121,7 +121,7 @@ def test_the_first_screen_answers_with_the_suite_and_has_no_other_table(tmp_path
     page.get_by_text("It fails in 2 of 2 runs.").wait_for()
     text = page.locator("main").inner_text()
     assert "complete: car test 0, 20 points, 1 unit: lost." in text and "python -m bench.suite" in text
-    assert page.locator("table.list tbody tr").count() == 2 and "2 of 2 complete at 1 unit (2 nan)" in text
+    assert page.locator("table.list tbody tr").count() == 2 and "2 of 2 at 1 unit" in text
     page.get_by_role("link", name="Suite").first.click()
     page.get_by_role("link", name="Dist", exact=True).click()
     page.get_by_text("No renderer makes more progress in any of 2 runs.").wait_for()
@@ -198,7 +198,7 @@ def test_methods_are_ranked_within_a_scale_on_the_scenes_that_all_have(tmp_path,
     assert sorted(titles) == sorted(
         f"scale={scale}: {words}"
         for scale in ("smoke", "desk")
-        for words in ("2 methods on the 1 scene (shape, view, seed, what is given) that all have", "1 method alone")
+        for words in ("2 methods on the 1 scene (shape, view, seed, what is given) that all share", "1 method alone")
     )
     assert page.locator("#board-list td.rank").all_inner_texts() == ["1", "2", "–"] * 2
     assert names_of(page)[:2] == ["DIST", "DVR"]
