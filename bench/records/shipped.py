@@ -33,7 +33,7 @@ def cell_value(cell: str) -> Any:
     return json.loads(cell) if isinstance(value, dict | list) else value  # each cell has its own
 
 
-@lru_cache(2**16)
+@lru_cache(2**18)
 def _parsed(cell: str) -> Any:
     try:
         return json.loads(cell)

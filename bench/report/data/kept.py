@@ -10,6 +10,7 @@ import gzip
 import json
 import zlib
 from collections.abc import Iterable
+from functools import cache
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -91,14 +92,31 @@ def _has_columns(value: Any, name: str) -> bool:
     return not any("." in key for key in value) if f"{name}.".startswith(CONFIG) else "." not in name
 
 
+@cache
+def _place(name: str) -> tuple[str, str]:
+    """The parts of a column's name: that of the node that has the value, and the value's key."""
+    if not name.startswith(CONFIG):
+        first, _, rest = name.partition(".")
+        return (first, rest) if rest else ("", first)
+    parent, _, key = name.rpartition(".")
+    return parent, key
+
+
+def _node(nodes: dict[str, Any], name: str) -> dict[str, Any]:
+    """The node of that name, made where it is missing."""
+    if name not in nodes:
+        parent, _, key = name.rpartition(".")
+        nodes[name] = _node(nodes, parent).setdefault(key, {})
+    return nodes[name]
+
+
 def _record(cells: dict[str, str]) -> Record:
     record: Record = {}
-    for name, value in ((name, cell_value(cell)) for name, cell in cells.items() if cell != ""):
-        *parents, key = name.split(".", -1 if name.startswith(CONFIG) else 1)
-        node = record
-        for parent in parents:
-            node = node.setdefault(parent, {})
-        node[key] = value
+    nodes: dict[str, Any] = {"": record}  # by the name of their column, without the last part
+    for name, cell in cells.items():
+        if cell != "":
+            parent, key = _place(name)
+            (nodes.get(parent) or _node(nodes, parent))[key] = cell_value(cell)
     if lacking := {"id", "status", "config"} - record.keys():
         raise ValueError(f"a line has no {', '.join(sorted(lacking))}")
     started(record)
