@@ -133,7 +133,7 @@ def _mark(cell: Any) -> str:
 
 def _breakdown_texts(cell: Any, unit: str) -> tuple[str, str]:
     """The breakdown as a short text, and as a text with its interval or the failures at an end of the sweep."""
-    mild, severe = (failures(cell, end) for end in ENDS)
+    mild, severe = (_failures(cell, end) for end in ENDS)
     low, high = ("" if math.isnan(end) else format.number(end) for end in (cell.breakdown_low, cell.breakdown_high))
     if not cell.is_measured:
         return (format.MISSING if cell.status == "unsupported" else cell.status,) * 2
@@ -148,11 +148,17 @@ def _breakdown_texts(cell: Any, unit: str) -> tuple[str, str]:
     return short, f"{short}{unit} ({interval})"
 
 
-def failures(cell: Any, end: str) -> str:
+def failed_trials(cell: Any, end: str) -> str:
+    """The number of failed trials at an end of the sweep."""
+    successes, trials = (getattr(cell, f"{end}_{name}") for name in ("successes", "trials"))
+    return f"{trials - successes:.0f} of {trials:.0f} trials failed"
+
+
+def _failures(cell: Any, end: str) -> str:
     """The number of failed trials at an end of the sweep; with repeats, the interval of their probability too."""
     successes, trials = (getattr(cell, f"{end}_{name}") for name in ("successes", "trials"))
     if not trials > 0:
         return "not tried"
     rate = statistics.clopper_pearson(1 - successes / trials, trials)
     share = "" if cell.one_trial else f", {100 * rate.low:.0f}-{100 * rate.high:.0f} %"
-    return f"{trials - successes:.0f} of {trials:.0f} trials failed{share}"
+    return f"{failed_trials(cell, end)}{share}"

@@ -119,13 +119,8 @@ class ConditionCurves:
 
     def _gain(self, group: pd.DataFrame, first: pd.DataFrame | None) -> statistics.Interval | None:
         """The ratio of the first measure to that at the first value, on the common shapes; None without any."""
-        common = group.index[:0] if first is None else group.index.intersection(first.index)
         key = self.measures[0].key
-        return (
-            statistics.ratio(*(statistics.by_shape(each.loc[common][key]) for each in (group, first)))
-            if len(common)
-            else None
-        )
+        return None if first is None else statistics.common_ratio(group[key], first[key])
 
     def _over_first(self, lines: list[Line]) -> dict[str, statistics.Interval]:
         """The ratio of each row of the figure at the compared value to the row at the first value."""
@@ -180,4 +175,4 @@ def _whole(value: float) -> float | int:
 
 
 def _median(values: pd.Series) -> statistics.Interval:
-    return statistics.typical(statistics.by_shape(values))
+    return statistics.typical(statistics.shape_groups(values))

@@ -89,8 +89,7 @@ def _cost_ratio(costs: Any, row: str, full: str) -> statistics.Interval | None:
     """The ratio of two rows' costs on the shapes on which both ended ok; None without any."""
     if not {row, full} <= {*costs}:
         return None
-    both = costs[[row, full]].dropna()
-    return statistics.ratio(*(statistics.by_shape(both[name]) for name in (row, full))) if len(both) else None
+    return statistics.common_ratio(costs[row].dropna(), costs[full].dropna())
 
 
 def _verdict(pooled: list[Line]) -> str:

@@ -23,35 +23,28 @@ NOTES = (
     "With 1 ray, a pixel's observation is its mask at the centre. With several, it is the covered fraction. Rows with "
     "mask or fraction in their name keep that observation for any number of rays. The figure leaves them out.",
 )
-SHAPE = ["family", "solid", "seed"]
 
 
 def notes(runs: Runs) -> list[str]:
     """The notes, with the error of the mean shape and ratios that are not tested."""
-    rays = runs.number(f"config.{RAYS}").fillna(1)
-    metrics = {key: runs.number(key) for key in ("area_error", "chamfer_l1", "start_area_error")}
-    frame = runs.frame[[*SHAPE, "row", "preset"]].assign(rays=rays, **metrics)
-    start = frame.groupby(SHAPE)["start_area_error"].first()
-    groups: dict[Any, Any] = {
-        key: group.set_index(SHAPE).sort_index() for key, group in frame.groupby(["preset", "row", "rays"])
-    }
-    further = {"Area error with 1 ray over that of the start": [], "Chamfer-L1 with 4 rays over that with 1": []}
-    starts, surfaces = further.values()
+    rays = runs.number(f"config.{RAYS}").fillna(PAGE.absent)
+    metrics = {key: runs.number(key).fillna(np.inf) for key in ("area_error", "chamfer_l1", "start_area_error")}
+    frame = runs.frame.assign(rays=rays, **metrics).set_index(condition_curves.SHAPE).sort_index()
+    start = frame["start_area_error"].groupby(level=condition_curves.SHAPE).first()
+    groups: dict[Any, Any] = dict([*frame.groupby(["preset", "row", "rays"])])
+    starts, surfaces = list[str](), list[str]()
     for (preset, row, count), group in groups.items():
-        first = groups.get((preset, row, 1))
-        if preset == "outline_relaxed" and count == 1:
-            starts.append(f"{row}, {_ratio(group['area_error'], start)}")
+        first = groups.get((preset, row, PAGE.first))
+        if preset == "outline_relaxed" and count == PAGE.first:
+            starts.append(f"{row}, {statistics.common_ratio(group['area_error'], start)}")
         if count == PAGE.compared and first is not None and preset not in CONTROLS:
-            surfaces.append(f"{row}, {_ratio(group['chamfer_l1'], first['chamfer_l1'])}")
+            surfaces.append(f"{row}, {statistics.common_ratio(group['chamfer_l1'], first['chamfer_l1'])}")
+    further = {
+        "Area error with 1 ray over that of the start": starts,
+        "Chamfer-L1 with 4 rays over that with 1": surfaces,
+    }
     texts = [note.format(start=start.median()) for note in NOTES]
     return [*texts, *(f"{title}, not tested: {'; '.join(rows)}." for title, rows in further.items() if rows)]
-
-
-def _ratio(errors: Any, others: Any) -> str:
-    """The median ratio on common shapes, with its interval."""
-    common = errors.index.intersection(others.index)
-    failed = (each.loc[common].fillna(np.inf) for each in (errors, others))
-    return str(statistics.ratio(*map(statistics.by_shape, failed)))
 
 
 PAGE = condition_curves.ConditionCurves(

@@ -266,7 +266,7 @@ COLUMNS = (  # a line is a run
     ),
     table.shown("Least error × 1000", _best),
     table.text("stopped", "Error still fell"),
-    table.Column("frugal_evaluations", "At pixel precision: evaluations, error × 1000", words=_at_pixel_precision),
+    table.shown("At pixel precision: evaluations, error × 1000", _at_pixel_precision),
     table.text("lost", "Failed candidates"),
 )
 PAGES = {"parsimony": make}

@@ -263,8 +263,7 @@ def _share_words(key: str) -> Callable[[dict[str, Any]], str]:
             return format.MISSING
         if cell.at_once or cell.never:
             word, end = ("mildest", "mild") if cell.at_once else ("survives", "severe")
-            trials, successes = (getattr(cell, f"{end}_{name}") for name in ("trials", "successes"))
-            return f"{breakdowns.title(cell.axis)}, {word} ({trials - successes:.0f} of {trials:.0f} trials failed)"
+            return f"{breakdowns.title(cell.axis)}, {word} ({breakdowns.failed_trials(cell, end)})"
         low, high = (100 * min(max(end, 0.0), 1.0) for end in (cell.level_low, cell.level_high))
         interval = "(one trial)" if cell.one_trial else f"[{low:.0f}, {high:.0f}]"
         return f"{breakdowns.title(cell.axis)}, {100 * cell.shade:.0f} % {interval}"

@@ -355,10 +355,9 @@ def _notes(made: Standing) -> list[str]:
         if ranked.level > MAX_LEVEL:
             pairs = f"no pair counts as significant, since {percent(ranked.level)} of simulated draws have a false pair"
         notes.append(f"At {units(budget)}, {pairs}. {least}; {possible}.")
-        for name, group in at_budget.groupby("set"):
-            count, total = (len(each["problem"].unique()) for each in (group, runs[runs["set"] == name]))
-            if count < total:
-                notes.append(f"At {units(budget)}, {name} has {count} of its {total} problems.")
+        counts, totals = (each.groupby("set")["problem"].nunique() for each in (at_budget, runs))
+        for name, count in counts[counts < totals.reindex(counts.index)].items():
+            notes.append(f"At {units(budget)}, {name} has {count} of its {totals[name]} problems.")
         further = at_budget[at_budget["ok"] & (at_budget["final"] > at_budget["initial"])]
         counts = further.groupby("set").size() / at_budget[at_budget["ok"]].groupby("set").size()
         for name, fraction in counts[counts > MENTIONED_FRACTION_OF_LARGER_ERRORS].items():

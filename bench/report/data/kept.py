@@ -93,7 +93,7 @@ def _has_columns(value: Any, name: str) -> bool:
 
 
 @cache
-def _place(name: str) -> tuple[str, str]:
+def _split(name: str) -> tuple[str, str]:
     """The parts of a column's name: that of the node that has the value, and the value's key."""
     if not name.startswith(CONFIG):
         first, _, rest = name.partition(".")
@@ -115,7 +115,7 @@ def _record(cells: dict[str, str]) -> Record:
     nodes: dict[str, Any] = {"": record}  # by the name of their column, without the last part
     for name, cell in cells.items():
         if cell != "":
-            parent, key = _place(name)
+            parent, key = _split(name)
             (nodes.get(parent) or _node(nodes, parent))[key] = cell_value(cell)
     if lacking := {"id", "status", "config"} - record.keys():
         raise ValueError(f"a line has no {', '.join(sorted(lacking))}")

@@ -133,6 +133,17 @@ def ratio(first: Groups, second: Groups) -> Interval:
     return _median_interval(_ratio(_shape_means(first), _shape_means(second)))
 
 
+def shape_groups(values: Any) -> list[np.ndarray]:
+    """The groups of a pandas series whose index begins with the family and the shape."""
+    return [group.to_numpy() for _, group in values.groupby(level=[0, 1])]
+
+
+def common_ratio(first: Any, second: Any) -> Interval | None:
+    """The `ratio` of two such series on the entries that both have; None without any."""
+    common = first.index.intersection(second.index)
+    return ratio(*(shape_groups(each.loc[common]) for each in (first, second))) if len(common) else None
+
+
 class Verdict(Enum):
     """The result of a test whether a ratio differs from 1."""
 
@@ -186,11 +197,6 @@ def _sign_test_p_value(points: Sequence[float]) -> float:
     """The two-sided p value of the sign test on values against 1; values of 1 do not count."""
     below, above = sum(x < 1 for x in points), sum(x > 1 for x in points)
     return min(1.0, 2 * float(special.bdtr(min(below, above), below + above, 0.5)))
-
-
-def by_shape(values: Any) -> list[np.ndarray]:
-    """The groups of a pandas series whose index begins with the family and the shape."""
-    return [group.to_numpy() for _, group in values.groupby(level=[0, 1])]
 
 
 def _shape_means(groups: Groups) -> np.ndarray:
