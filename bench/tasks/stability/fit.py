@@ -27,17 +27,20 @@ from datasets.scene import View
 from datasets.views import ViewSampler
 from renderers.camera import Camera
 from renderers.field import Counts, Field, Meter, estimate_lipschitz
+from renderers.fields import analytic
 from renderers.fields.analytic import Shape
 from renderers.rendering import Renderer
 
 SLOPE_POINTS = 4096
 HOLE_RADIUS = 0.3  # scene units
+OCCLUDER_RADIUS, OCCLUDER_OFFSET = 0.2, 0.1  # scene units; the offset is that of the initial position
+OCCLUDER_REACH = 0.6  # scene units: the maximum distance of its middle from the origin keeps it inside the sphere
 AZIMUTHS, ELEVATIONS = (0.0, 360.0), (15.0, 35.0)  # degrees
 SPREAD_VIEWS, ALL_SIDES_DEGREES = 3, 240.0
 DEFINITIONS = {
     "surface_error": "mean magnitude of the fitted field at the points of the true surface that the view shows, in "
-    "scene units; on the axis one_sided_views, at those that three sides show; on the axis new_hole, the error of the "
-    "hole's radius",
+    "scene units; on the axis one_sided_views, at those that three sides show; on the axes new_hole and occlusion, the "
+    "error of the hole's radius or of the occluder's position",
     "evaluations_per_ray": "field values computed, divided by rays times iterations",
 }
 
@@ -126,7 +129,8 @@ OF_TRUTH = {"outside_family": outside_family}
 DURING_FIT = {"growing_slope": growing_slope}  # the severity grows from 1 over the fit
 FIT_SETTINGS = {"far_start": "offset", "learning_rate": "learning_rate"}  # the severity replaces these settings
 # The last has no disturbance: the severity is a renderer's setting.
-FITS = (*DISTURBANCES, *OF_BOTH, *OF_TRUTH, *DURING_FIT, *FIT_SETTINGS, "new_hole", "one_sided_views", "a_code")
+OTHERS = ("new_hole", "occlusion", "one_sided_views", "a_code")
+FITS = (*DISTURBANCES, *OF_BOTH, *OF_TRUTH, *DURING_FIT, *FIT_SETTINGS, *OTHERS)
 
 
 @dataclass(frozen=True)
@@ -142,27 +146,51 @@ class Hole:
             torch.linalg.cross(points - self.start.to(points), self.direction.to(points).expand_as(points)), dim=-1
         )
 
-    def through(self, shape: Field, radius: Float[Tensor, ""] | float) -> Field:
+    def applied(self, shape: Field, radius: Float[Tensor, ""]) -> Field:
         return Shape(lambda points: torch.maximum(shape(points), radius - self.distance(points)), shape.kind, None)
+
+
+@dataclass(frozen=True)
+class Occluder:
+    """A round part before a surface, at an unknown position across the view.
+
+    It is a ball if its edge is rounded by its radius. With a sharp edge it is a short cylinder that faces the camera.
+    Then its visible surface does not change when it moves across the view. Only its outline before the shape does.
+    """
+
+    middle: Float[Tensor, "3"]
+    axes: Float[Tensor, "3 3"]  # rows: to the right, towards the camera, downwards; scene directions
+    rounding: float  # scene units
+
+    def applied(self, shape: Field, position: Float[Tensor, "2"]) -> Field:
+        half = OCCLUDER_RADIUS - self.rounding
+        cylinder = analytic.cylinder(half, half)
+
+        def value(points: Tensor) -> Tensor:
+            moved = (points - self.middle.to(points)) @ self.axes.to(points).T
+            across = torch.stack([position[0], torch.zeros_like(position[0]), position[1]])
+            return torch.minimum(shape(points), cylinder(moved - across) - self.rounding)
+
+        return Shape(value, shape.kind, shape.lipschitz)
 
 
 @dataclass
 class CodeFit:
-    """The problem of finding a code, and the radius of any hole; see `bench.solve.optimise.Optimisable`."""
+    """The problem of finding a code, and the unknown of any modification; see `bench.solve.optimise.Optimisable`."""
 
     fit: str
     severity: float
     prior: Prior
     code: Float[Tensor, " code_length"]
-    radius: Float[Tensor, ""]
-    hole: Hole | None
+    unknown: Float[Tensor, "*shape"]  # of the modification: a radius or a position
+    modification: Hole | Occluder | None
     views: list[ObservedView]
     limits: Limits
     iterations: int
     counts: Counts = field(default_factory=Counts)
 
     def __post_init__(self) -> None:
-        self.parameters = [self.code] if self.hole is None else [self.code, self.radius]
+        self.parameters = [self.code] if self.modification is None else [self.code, self.unknown]
         self.watched = self.limits.watch(self.field(0.0), self.code.device)  # the limit is on the whole fit
 
     def loss(self, iteration: int) -> dict[str, Tensor]:
@@ -179,7 +207,7 @@ class CodeFit:
             shape = OF_BOTH[self.fit](shape, self.severity)
         if self.fit in DURING_FIT and progress > 0:
             shape = DURING_FIT[self.fit](shape, 1 + progress * (self.severity - 1))
-        return shape if self.hole is None else self.hole.through(shape, self.radius)
+        return shape if self.modification is None else self.modification.applied(shape, self.unknown)
 
 
 def judge_fit(
@@ -200,7 +228,8 @@ def judge_fit(
     assert prior is not None
     if name in FIT_SETTINGS:
         fit = replace(fit, **{FIT_SETTINGS[name]: severity})
-    code, initial = _draw_codes(prior, draw, fit.offset)
+    is_occluded = name == "occlusion"  # then the initial code is the true one, and only the position is unknown
+    code, initial = _draw_codes(prior, draw, 0.0 if is_occluded else fit.offset)
     true: Field = prior.decoder.at(code)
     if name in OF_BOTH or name in OF_TRUTH:
         true = (OF_BOTH | OF_TRUTH)[name](true, severity)
@@ -208,11 +237,9 @@ def judge_fit(
     is_spread = name == "one_sided_views"
     cameras = _cameras(direction, fit.resolution, severity if is_spread else None)
     observations = [_observe(true, camera) for camera in cameras]
-    hole = None
-    if name == "new_hole":
-        # The initial radius is that far below half of it (Mehta et al. 2022, on the topology of level sets).
-        hole = _hole(observations[0])
-        true = hole.through(true, HOLE_RADIUS)
+    modification, unknown, initial_unknown = _modification(name, severity, observations[0], draw)
+    if modification is not None:
+        true = modification.applied(true, unknown)
         observations = [_observe(true, camera) for camera in cameras]
     sides = _cameras(direction, fit.resolution, ALL_SIDES_DEGREES) if is_spread else []
     points = _seen_points([_observe(true, camera) for camera in sides] or observations).to(device)
@@ -221,8 +248,8 @@ def judge_fit(
     fitted = replace(prior, decoder=deepcopy(prior.decoder).to(device))
     problem = CodeFit(
         *(name, severity, fitted, initial.to(device).requires_grad_()),
-        radius=torch.tensor(HOLE_RADIUS / 2 - severity, device=device, requires_grad=True),
-        hole=hole,
+        unknown=initial_unknown.to(device).requires_grad_(),
+        modification=modification,
         views=[_view(each, fit, renderer, device) for each in observations],
         limits=conditions.limits,
         iterations=fit.iterations,
@@ -231,8 +258,8 @@ def judge_fit(
     settings = OptimiserSettings(fit.iterations, fit.learning_rate, "cosine")
     optimise(problem, settings, device, history=history, on_step=lambda line: None)
     with torch.no_grad():
-        off = problem.field(0.0)(points).abs().mean() if hole is None else (problem.radius - HOLE_RADIUS).abs()
-        error = float(off)
+        surface_error = problem.field(0.0)(points).abs().mean()
+        error = float(surface_error if modification is None else (problem.unknown.cpu() - unknown).norm())
     rays = sum(each.observed.numel() for each in observations)
     evaluations_per_ray = history.counts.value / rays / max(len(history.curve), 1)
     return Outcome(
@@ -272,12 +299,29 @@ def _view(observation: Observation, fit: FitSettings, renderer: Renderer, device
     return ObservedView.of(view, fit, renderer, observed=observation.observed, mask=mask, device=device)
 
 
-def _hole(observation: Observation) -> Hole:
-    """A hole from the camera through the middle of the visible surface."""
+def _modification(
+    name: str, severity: float, observation: Observation, draw: np.random.Generator
+) -> tuple[Hole | Occluder | None, Tensor, Tensor]:
+    """The modification of the true shape, the true value of its unknown, and the initial value."""
     camera, hit = observation.camera, observation.mask.flatten()
     rays = camera.rays().flat()
     middle = rays.directions[hit].mean(dim=0) if hit.any() else rays.directions.mean(dim=0)
-    return Hole(camera.center.float(), torch.nn.functional.normalize(middle, dim=0))
+    direction = torch.nn.functional.normalize(middle, dim=0)
+    if name == "new_hole":
+        # The initial radius is that far below half of the true one (Mehta et al. 2022, on the topology of level sets).
+        start = HOLE_RADIUS / 2 - severity
+        return Hole(camera.center.float(), direction), torch.tensor(HOLE_RADIUS), torch.tensor(start)
+    if name == "occlusion":
+        # A ray that hits a surface has no gradient of such an outline (Li et al. 2018; Vicini et al. 2022).
+        nearest = ((rays.directions - direction).norm(dim=-1) + ~hit * 10.0).argmin()
+        right = torch.nn.functional.normalize(torch.linalg.cross(direction, torch.tensor([0.0, 1.0, 0.0])), dim=0)
+        axes = torch.stack([right, -direction, torch.linalg.cross(direction, right)])
+        shown = rays.at(camera.distance(observation.depth).flatten())[nearest]
+        angle = draw.uniform(0.0, 2 * np.pi)
+        start = OCCLUDER_OFFSET * torch.tensor([np.cos(angle), np.sin(angle)]).float()
+        shown *= (OCCLUDER_REACH / shown.norm()).clamp(max=1.0)
+        return Occluder(shown, axes, severity * OCCLUDER_RADIUS), torch.zeros(2), start
+    return None, torch.zeros(0), torch.zeros(0)
 
 
 def _seen_points(observations: list[Observation]) -> Float[Tensor, "n 3"]:

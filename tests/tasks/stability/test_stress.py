@@ -16,13 +16,14 @@ from bench.solve.optimise import History
 from bench.tables import choice, names
 from bench.tasks.stability import fit
 from bench.tasks.stability.axes import Stress, Sweep
-from bench.tasks.stability.fit import _failure, judge_fit
+from bench.tasks.stability.fit import OCCLUDER_RADIUS, Occluder, _failure, judge_fit
 from bench.tasks.stability.judge import judge_gradient, judge_rendering, truth
 from bench.tasks.stability.scenes import CAMERA_DISTANCE, SCENES
 from bench.tasks.stability.search import Bisection, Search, SearchSettings
 from bench.tasks.stability.solids import box, half_space, rod, sphere_solid
 from bench.tasks.stability.trial import Conditions, Criteria, Failure, FitSettings
 from renderers.camera import Rays
+from renderers.fields.analytic import plane
 from renderers.fields.mlp import Decoder
 from renderers.rendering import Status, Unsupported
 from renderers.silhouette import Own
@@ -255,15 +256,33 @@ def test_a_disturbed_fit_ends_further_off(scene):
 
 
 @pytest.mark.slow
-@each("name", ["growing_slope", "new_hole", "outside_family", "thin_parts", "one_sided_views"])
-def test_a_fit_of_a_code_succeeds_at_the_mild_end_and_fails_at_the_severe_one(name):
+@each(
+    "name, renderer",
+    [("growing_slope", "dist"), ("new_hole", "dist"), ("outside_family", "dist"), ("thin_parts", "dist"),
+     ("one_sided_views", "dist"), ("occlusion", "dvr")],
+)  # fmt: skip
+def test_a_fit_of_a_code_succeeds_at_the_mild_end_and_fails_at_the_severe_one(name, renderer):
     stress = stress_named(name)
     held = replace(
         conditions(), prior=sofa_prior(), fit=replace(FIT, resolution=20, silhouette=load("silhouette", "hinge"))
     )
-    mild, severe = (stress.trial(load("renderer", "dist"), level, 0, held) for level in (0.0, 1.0))
+    mild, severe = (stress.trial(load("renderer", renderer), level, 0, held) for level in (0.0, 1.0))
     assert mild.success and severe.numbers["surface_error"] > 2 * mild.numbers["surface_error"]
     assert not severe.success
+
+
+def test_an_occluder_is_a_ball_at_first_and_at_last_its_front_does_not_change_when_it_moves():
+    axes, middle, far = torch.eye(3), torch.tensor([0.1, 0.2, 0.3]), plane(offset=-9.0)
+    points = torch.rand(50, 3) - 0.5
+    moved = torch.tensor([0.05, -0.02])
+    ball = Occluder(middle, axes, OCCLUDER_RADIUS).applied(far, moved)
+    center = middle + torch.tensor([0.05, 0.0, -0.02])
+    torch.testing.assert_close(ball(points), torch.linalg.vector_norm(points - center, dim=-1) - OCCLUDER_RADIUS)
+    front = middle + torch.tensor([0.0, OCCLUDER_RADIUS, 0.0])
+    for rounding, slope in ((0.02 * OCCLUDER_RADIUS, 0.0), (OCCLUDER_RADIUS, 1e-2)):
+        position = moved.clone().requires_grad_()
+        Occluder(middle, axes, rounding).applied(far, position)(front).backward()
+        assert (position.grad.norm() > slope) == (slope > 0)
 
 
 def test_evaluations_of_a_trial_are_limited_over_all_iterations_of_a_fit():
