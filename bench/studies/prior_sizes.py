@@ -2,11 +2,8 @@
 
 from typing import Any
 
-import torch
-
 from bench.records import format
 from bench.report.study import Result, Runs, Selection, chart, compare, records, statistics, table
-from renderers.fields.mlp import Decoder
 
 PLACE = 24
 READS = (Selection("prior_sizes", tuple(f"prior.network.{key}" for key in ("layers", "width", "code_length", "skip"))),)
@@ -65,9 +62,18 @@ def _lines(runs: Runs, compared: compare.Compared) -> list[Line]:
 
 def _size(network: dict[str, Any]) -> Line:
     """The network in words, the length of its code, and the number of its weights."""
-    with torch.device("meta"):
-        numbers = sum(parameter.numel() for parameter in Decoder(**network).parameters())
-    return {"network": f"{network['layers']} × {network['width']}", "code": network["code_length"], "numbers": numbers}
+    layers, width, code = (network[key] for key in ("layers", "width", "code_length"))
+    return {"network": f"{layers} × {width}", "code": code, "numbers": weights(**network)}
+
+
+def weights(layers: int, width: int, code_length: int, skip: int, *, narrow: bool) -> int:
+    """The number of weights and biases of a `renderers.fields.mlp.Decoder`."""
+    inputs, sizes = [code_length + 3] + [width] * (layers - 1), [width] * layers
+    if skip and narrow:
+        sizes[skip - 1] -= code_length + 3
+    elif skip:
+        inputs[skip] += code_length + 3
+    return sum((i + 1) * o for i, o in zip([*inputs, width], [*sizes, 1], strict=True))
 
 
 def _verdict(pooled: list[Line]) -> str:
