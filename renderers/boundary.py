@@ -1,7 +1,7 @@
 """Checks what a renderer returns, so that a broken contract gives one clear message.
 
-Values, which may be NaN, are not checked here; `hits` checks the values of hits. The check of a valid rendering costs a
-few comparisons of shapes and types, and no field evaluation.
+Whether values are finite is not checked here; `hits` checks the distances of hits. The check of a valid rendering
+costs a few comparisons of shapes and types, and no field evaluation.
 """
 
 import torch

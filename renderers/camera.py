@@ -227,8 +227,8 @@ def sphere_span(
     """Where rays enter and leave the sphere of `radius` about the origin.
 
     Returns:
-        entry, leave: distances along the ray. Entry is 0 if the ray starts inside. If it misses, both are the distance
-            of the closest approach. Gradients flow to the rays.
+        entry, leave: distances along the ray. Entry is 0 if the ray starts inside. If it misses, leave is the
+            distance of the closest approach, and entry is the same but at least 0. Gradients flow to the rays.
         intersects: false if the ray misses the sphere, or the sphere lies behind the ray's origin.
     """
     approach = -(rays.origins * rays.directions).sum(-1)

@@ -64,7 +64,8 @@ class Rendering:
         distance: along the ray to its end; on a surface only if `hit`. Differentiable as the renderer states.
         status: of each ray, a Status as int8.
         points: the points at `distance`.
-        residual: the last field value on the ray, a measure of the remaining error. Not differentiable.
+        residual: the field value that the renderer reports as its remaining error: at the hit, or at the last or
+            closest sample. Not differentiable.
         closest: the field's value, with its sign, at the sample of smallest magnitude on the ray. Its magnitude minus a
             threshold is DIST's soft silhouette (Sec. 3.3, A.3). Differentiable, except on deferred rays.
         deferred: the rays whose `closest` has no gradient yet, since most losses need it on few rays; else None.
@@ -182,7 +183,11 @@ class Scheduled(Protocol):
 
 @runtime_checkable
 class Stateful(Protocol):
-    """A renderer with a memory of one optimisation."""
+    """A renderer with a memory of one optimisation.
+
+    The loop begins with a rendering that is not counted. A renderer that is also scheduled clears its memory at
+    iteration 0.
+    """
 
     def with_empty_memory(self) -> Renderer:
         """The same renderer for another optimisation."""

@@ -1,8 +1,8 @@
 """Silhouette losses for the rendering of any renderer, so that all renderers can use the same loss.
 
-`Own` is the renderer's own loss. The other three use what every renderer returns: `hit`, `distance` and `closest`.
-Their gradient is the gradient of the renderer's `closest`; the hinge uses it only on wrong rays. On a hit,
-the `closest` of `naive` follows the surface, so that its spurious hits are hardly pushed away.
+`Own` is the renderer's own loss. `Hinge` and `CrossEntropy` use `closest`, whose gradient the renderer gives; the hinge
+uses it only on wrong rays. `Occupancy` evaluates the field at new points. `Area` needs opacities.
+On a hit, the `closest` of `naive` follows the surface, so that its spurious hits are hardly pushed away.
 """
 
 from abc import ABC, abstractmethod

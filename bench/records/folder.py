@@ -17,18 +17,21 @@ from bench.config import AUTO, OUR_PACKAGES, PRIOR_FIELD, Rerun, check, check_re
 from bench.records.imports import ROOT, imported_files
 from bench.records.record import NEUTRAL_KEYS, RunStatus, bad_link, digest, file_lock, is_outside, read_record, to_json
 from bench.records.results import PlannedRun
-from bench.tables import extensions, without_row_keys
+from bench.tables import CONF, extensions, without_row_keys
 from datasets.extras import referenced_files, version
 
 NO_STRESS = "none"
 # Keys whose values are files or folders.
 INPUT_FILE_KEYS = ("path", "image_path", "mask_path", "images", "truth", "codes", "cloud")
-# A run with such a key loads a choice by its name: the module of all such choices is hashed too.
-LOADED_BY_NAME = {("task", "beside"): "renderers", ("prior", "of"): "datasets.families"}
+# A run with such a key loads a choice by its name: the module and the files in conf of all such choices are hashed too.
+LOADED_BY_NAME = {
+    ("task", "beside"): ("renderers", ("renderer/*.yaml", "variants.yaml")),
+    ("prior", "of"): ("datasets.families", ("dataset/*.yaml", "shapes.yaml")),
+}
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".gz")  # not hashed: gigabytes that no run reads
 FIELD_FILE = "field.safetensors"  # the only file of a run folder that another run reads
 HASHED_LIBRARIES = ("torch", "numpy", "scipy", "open3d", "pymeshlab", "trimesh", "scikit-image")
-RESERVED_BYTES = 64 * 1024  # kept free, so that the record can still be written on a full disk
+RESERVED_BYTES = 64 * 1024  # occupied until the last write, so that a disk that fills up has room for the record
 RESERVE_FILE = ".reserve"
 # Keys that do not change a result, such as a limit. They can decide whether a failed run fails again.
 LIMIT_KEYS = NEUTRAL_KEYS - {"results_dir", "verbose", "rerun", "plan", "tracker"}
@@ -44,7 +47,7 @@ def config_hash(config: Mapping[str, Any]) -> str:
 
 
 def code_hash(config: Mapping[str, Any]) -> str:
-    """Hash of our code, the user's packages, library versions and the files that `INPUT_FILE_KEYS` name."""
+    """Hash of the modules that the run imports, the user's packages, libraries, shipped priors and input files."""
     used_packages = _user_packages(config)
     listed = [str(package) for package in config.get("packages") or []] if used_packages else []
     packages = sorted({*listed, *used_packages} - {*OUR_PACKAGES})  # a class may import a listed package
@@ -61,7 +64,9 @@ def code_hash(config: Mapping[str, Any]) -> str:
     files += [_class_counts_hash(str(dataset.get(key))) for key in ("path", "renders") if "synset" in dataset]
     hashed = {key: value for key, value in config.items() if key not in NEUTRAL_KEYS}
     targets = {*_values_of_key(hashed, "_target_")}
-    targets |= {module for (group, key), module in LOADED_BY_NAME.items() if (hashed.get(group) or {}).get(key)}
+    by_name = [entry for (group, key), entry in LOADED_BY_NAME.items() if (hashed.get(group) or {}).get(key)]
+    targets |= {module for module, _ in by_name}
+    files += [_file_hash(path) for _, patterns in by_name for each in patterns for path in sorted(CONF.glob(each))]
     targets |= {extensions()[purpose] for purpose in _used_extensions(hashed)}
     code = _our_code_hash(frozenset(targets), bool(packages))
     return digest([code, *(_package_hash(name) for name in packages), *files])
@@ -86,7 +91,7 @@ def _user_packages(config: Mapping[str, Any]) -> set[str]:
 
 
 def resolve_config(config: DictConfig, choices: Mapping[str, Any]) -> dict[str, Any]:
-    """A composed configuration as plain data. Missing values are kept; they become an error in the run's record.
+    """A composed configuration as plain data. Missing values are kept; the check of its objects reports them.
 
     Args:
         config: a configuration without Hydra's node.
@@ -187,7 +192,7 @@ def archive_run(folder: Path, earlier: Path) -> None:
 def content_hash(folder: Path) -> str:
     """Hash of a run folder's files, without the fields `asked` and `reused` of its record."""
     total_hash = hashlib.sha256()
-    for path in sorted(file for file in folder.rglob("*") if file.is_file()):
+    for path in sorted(file for file in folder.rglob("*") if file.is_file() and file.name != RESERVE_FILE):
         content = path.read_bytes()
         if path.name == "record.json":
             content = _without_requests(content)

@@ -1,4 +1,4 @@
-"""The modules of this project that a run imports, read from their source: only an edit of these makes it stale."""
+"""The modules and kernels of this project that a run imports: only an edit of these makes it stale."""
 
 import re
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ IMPORT = re.compile(r"^[ \t]*(?:from ([\w.]+) import (\([^)]*\)|.*)|import ([\w.
 
 
 def imported_files(targets: Iterable[str]) -> list[Path]:
-    """The files of this project that a run imports, in order.
+    """The files of this project that a run imports, in order, with the C++ file of a module that has one.
 
     Args:
         targets: dotted names of the classes that its configuration names.
@@ -28,7 +28,8 @@ def imported_files(targets: Iterable[str]) -> list[Path]:
             remaining += _imports(module)
             if module in LISTED:
                 remaining += [f"{module}.{path.stem}" for path in (ROOT / module.replace(".", "/")).glob("*.py")]
-    return sorted(path for module in modules if (path := _file(module)))
+    files = [path for module in modules if (path := _file(module))]
+    return sorted([*files, *(kernel for path in files if (kernel := path.with_suffix(".cpp")).is_file())])
 
 
 @cache

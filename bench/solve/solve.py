@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from math import inf
+from math import inf, isnan
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -34,7 +34,7 @@ COST_DEFINITIONS = {
     "evaluations.coarse": "points whose value was computed more cheaply, in bfloat16, where it decides nothing; absent "
     "without any, and not among those of value",
     "evaluations.masked": "not in these: points of rays that had ended, whose values were computed and thrown away, "
-    "since a march on a GPU looks every eight steps only which rays go on; absent without any",
+    "because a march on a GPU removes finished rays only every eight steps; absent without any",
     "evaluations.gradient": "points through whose field value a gradient other than zero was propagated back",
     "evaluations.cost": "field evaluations: those of value, twice those of gradient, and an eighth of coarse ones",
     "evaluations.observed": "pixels whose depth was given",
@@ -47,7 +47,7 @@ COST_DEFINITIONS = {
     "seconds.backward": "back-propagation and the optimiser's step, over all iterations",
     "seconds.evaluation": "meshes, metrics and pictures; not part of the loop's time",
     "seconds.total": "the whole run, including making or loading shapes and prior",
-    "peak_memory_bytes": "highest rise of PyTorch's memory on a GPU, in the loop; of no CPU, where it does not repeat",
+    "peak_memory_bytes": "highest rise of PyTorch's memory on a GPU, in the loop; not measured on a CPU",
     "flops": "evaluations times the field's operations per evaluation, coarse ones included",
     "gemm_fraction": "seconds that the flops take at the machine's best rate of a matrix product, in float32 or, of "
     "coarse values, in bfloat16, over the loop's seconds; above 1 where compiled code is faster than PyTorch's product",
@@ -367,7 +367,9 @@ def failure_of(history: History, after: Evaluation) -> tuple[RunStatus, str] | N
     if after.failure is not None:
         return after.failure
     first, last = history.objectives or (history.first_loss, history.curve[-1]["total"])
+    measure = "objective" if history.objectives else "loss"
+    if isnan(last):
+        return RunStatus.NAN, f"the {measure} is not a number at the end"
     if last >= first and last > 0 and len(history.curve) > 1:
-        measure = "objective" if history.objectives else "loss"
         return RunStatus.NOT_REACHED, f"the {measure} did not fall: {first:.4g} at the start, {last:.4g} at the end"
     return None

@@ -116,9 +116,9 @@ class RayFront:
     ) -> "RayFront":
         """The front of finer rays, each continuing from its coarse `parent`; for `careful`, see Stepping.
 
-        If a coarse ray missed the sphere, or started inside the shape, its finer rays start again at the sphere. If it
-        left the sphere, they have left it too. The samples of a coarse ray without a hit are kept: its closest sample
-        may lie behind the finer ray's start.
+        If a coarse ray missed the sphere, or started inside the shape, its finer rays start again at the sphere. A
+        finer ray that would start beyond its exit from the sphere is a miss. The samples of a coarse ray without a hit
+        are kept: its closest sample may lie behind the finer ray's start.
         """
         child = RayFront.on_sphere(rays, radius=radius, samples=self.sample_distance.shape[1])
         status, start = self.status[parent], self.distance[parent]

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from bench.records import folder
 from bench.records.folder import code_hash
 from bench.records.imports import ROOT, imported_files
 
@@ -22,7 +23,13 @@ def files_of(*targets: str) -> set[str]:
 
 def test_a_run_depends_on_its_renderer_and_dataset_and_on_no_other():
     files = files_of(*COMPLETION)
-    used = {"renderers/dist.py", "renderers/tracing/march.py", "datasets/families.py", "bench/solve/optimise.py"}
+    used = {
+        "renderers/dist.py",
+        "renderers/tracing/march.py",
+        "renderers/kernels/decoder.cpp",
+        "datasets/families.py",
+        "bench/solve/optimise.py",
+    }
     assert used <= files and len(files) <= MAX_FILES
     others = {
         "renderers/dvr.py",
@@ -53,3 +60,15 @@ def test_a_run_that_loads_choices_by_name_depends_on_all_of_them():
     config = {"task": {"_target_": "bench.tasks.ablation.Ablation"}, "prior": {}}
     alone, beside_others = (code_hash(config | {"task": config["task"] | {"beside": names}}) for names in ([], ["dvr"]))
     assert alone != beside_others
+
+
+def test_a_run_depends_on_the_settings_of_a_renderer_that_it_loads_by_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(folder, "CONF", tmp_path)
+    (tmp_path / "renderer").mkdir()
+    hashes = []
+    for steps in (1, 2):
+        (tmp_path / "renderer" / "dvr.yaml").write_text(f"steps: {steps}\n")
+        task = {"_target_": "bench.tasks.ablation.Ablation", "beside": ["dvr"]}
+        hashes.append([code_hash({"task": task | {"beside": names}, "prior": {}}) for names in ([], ["dvr"])])
+    (alone, loaded), (alone_later, loaded_later) = hashes
+    assert alone == alone_later and loaded != loaded_later

@@ -301,3 +301,8 @@ def test_a_run_is_judged_by_its_loss_and_surface(ended, losses, mesh, status):
     after = Evaluation({}, failure=None if mesh else (RunStatus.EMPTY, "nothing is there"))
     result, reason = solve.failure_of(history, after) or (RunStatus.OK, "")
     assert result is status and bool(reason) is (status is not RunStatus.OK)
+
+
+def test_a_run_whose_last_objective_is_not_a_number_is_not_ok():
+    history = History(curve=[{"total": 2.0}, {"total": 1.0}], first_loss=2.0, objectives=[1.0, float("nan")])
+    assert solve.failure_of(history, Evaluation({})) == (RunStatus.NAN, "the objective is not a number at the end")
