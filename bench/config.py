@@ -35,8 +35,8 @@ PRIOR_DATASET_KEY = "of"  # key of the node `prior`: the dataset that it was tra
 # Keys of a dataset or a task that other nodes refer to.
 FOLLOWED_KEYS = ("_prior_", "_field_", "_multiview_", "_similarity_", "_iterations_", "_silhouette_weight_")
 EPSILON_KEY = "_epsilon_"  # key of the node `task`, which renderers refer to; set by effort=needed
+# Keys of nodes that are not arguments of their class, as `_target_` is not.
 MARKS = (CLASS_PACKAGE_KEY, *FOLLOWED_KEYS, EPSILON_KEY, PRIOR_DATASET_KEY, LABEL_KEY, ROWS_KEY, LOOK_KEY)
-# All keys of a node except these and `_target_` are arguments.
 ROLE_OF_NODE = {  # the protocol or base class that the class of a node must have
     "task": "bench.setup.inputs.Task",
     "renderer": "renderers.rendering.Renderer",

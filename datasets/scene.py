@@ -322,7 +322,7 @@ class Photographed(Protocol):
 
         Args:
             longest: largest number of pixels per side.
-            held_out: every photograph of such a number is not used for the sphere.
+            held_out: every n-th photograph is held out, and does not influence the sphere.
         """
         ...
 

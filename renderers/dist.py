@@ -22,14 +22,14 @@ class DIST:
 
     Source: DIST, Secs. 3.1 to 3.4, A.1 to A.3, B.2.
     Differentiable in: field parameters and rays, by the approximate rule of Eq. 4. The gradient of `distance` has the
-        right direction at each pixel and a wrong scale, alpha * K * cos(angle of incidence); see
+        right direction at each pixel and a wrong scale, alpha * K times the field's slope along the ray; see
         `gradients.attach_approximate_gradient`. The gradient of `closest` is exact at a fixed sample.
-    Needs: a distance or a bound inside the sphere; a trained network is close enough to one.
+    Needs: a distance or a bound inside the sphere. A trained decoder is used as a distance.
     Deviates from the paper: `extra_step_cap`, `careful_split`, `step_back`, `least_step`, `slope_samples` and `coarse`
         are ours. `silhouette_signed` and the `silhouette_average` "missed_plus_spurious" are as in the official code;
-        Eq. 11 states neither sign nor average. `step_clamp` is as in the official code: the paper's networks are
-        truncated at 0.1. A ray that starts at negative values stops at once with STARTED_INSIDE. Coarse to fine applies
-        to rays of an image (`Rays.image`); others march at full resolution.
+        Eq. 11 states neither sign nor average. `step_clamp` is as in the official code, for networks that were trained
+        on distances truncated at 0.1. A ray that starts at negative values stops at once with STARTED_INSIDE. Coarse to
+        fine applies to rays of an image (`Rays.image`); others march at full resolution.
 
     Args:
         steps: maximum marching steps per ray.
@@ -37,7 +37,7 @@ class DIST:
             `tracing.march.Stepping`.
         slope_samples: points at which the Lipschitz constant is estimated before the march
             (`field.estimate_lipschitz`); values are divided by it. 0 trusts the field.
-        coarse_to_fine: start with one ray per 4 x 4 pixels.
+        coarse_to_fine: start with one ray per 4 x 4 pixels; unrelated to `coarse`.
         n_gradient_samples: K, the number of samples of smallest magnitude that carry the gradient of a hit.
         sphere_radius: of the sphere about the origin that contains the shape.
         silhouette_signed, silhouette_average: see `silhouette.Hinge`.

@@ -27,7 +27,8 @@ class DVR:
     Needs: any level set: only signs are searched. Parts thinner along the ray than the spacing may be missed.
     Deviates from the paper: the first sample lies where the ray enters the volume (Eq. 9 from j = 0, as in the official
         code), which is the unit sphere. A ray that starts occupied has STARTED_INSIDE. Rays have a gradient, unlike in
-        the official code. A flat crossing keeps its slope's sign; in the official code it counts as entering.
+        the official code. If the slope along the ray is nearly 0, its sign is kept; the official code takes it as
+        negative.
         `early_stop` is ours. L_occupancy (Eq. 15) is at a random point even if depth is observed, unless `occupied_at`
         is "depth". With several masks of one object, the paper uses the depth of the visual hull; here a task can
         provide it as the observed depth (`task.guide=hull` of task=reconstruction).

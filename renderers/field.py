@@ -143,7 +143,7 @@ def marching_values(field: Field, steps: int, *, epsilon: float, coarse: bool) -
 
 
 class LateInt:
-    """A field of a dataclass whose number a GPU may still be computing: reading it waits, `Counts.add` does not.
+    """An attribute of a dataclass that may be a tensor on a GPU: reading it waits, `Counts.add` does not.
 
     See "descriptor-typed fields" in Python's documentation of dataclasses. The default is 0.
     """
@@ -203,7 +203,7 @@ class Counts:
         """The work of these evaluations, divided by one value and one gradient per hit; None without hits.
 
         No renderer can do less work, if every hit has a gradient. If the field does not state its operations, a
-        gradient counts as much as a value. A coarse value always does.
+        gradient counts as much as a value. A coarse value counts as much as an exact one.
         """
         cost = field.flops or Flops(1, 1)
         minimum_work = (cost.value + cost.gradient) * self.hits
@@ -241,7 +241,7 @@ class Wrapper(ABC):
 
 @dataclass(frozen=True)
 class Meter(Wrapper):
-    """A Field that counts the evaluations of the field `inner`, so that no renderer can under-report.
+    """A Field that counts the evaluations of the field `inner`; bounds are counted as the renderer reports them.
 
     A value evaluation is one point passed to the field. A gradient evaluation is one point through whose value a
     non-zero gradient was propagated back; it is counted during the backward pass.

@@ -54,7 +54,7 @@ def approximate_rendering(field: Field, rays: Rays, front: RayFront, *, alpha: f
     """The rendering of a marched front, whose hits have the approximate gradient.
 
     Args:
-        rays: of any leading shape; the front has them in one row.
+        rays: of any leading shape; the front has them flattened.
         front: after the march.
         alpha: the factor of the marching step.
         radius: of the sphere about the origin that contains the shape.

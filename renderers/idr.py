@@ -23,6 +23,7 @@ class IDR(SurfaceRenderer):
     Needs: a distance or a bound inside the sphere.
     Deviates from the paper: marches from the camera only, and does not search rays that have not converged. The
         smallest field value on a ray is one of the marched samples. A ray that starts at negative values stops at once.
+        The sharpness of the mask loss is constant; the paper doubles it.
 
     Args:
         steps: maximum marching steps per ray.

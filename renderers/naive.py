@@ -24,8 +24,8 @@ class Naive:
     settings give the first rows of DIST's Table 1: rays one by one or all at once, and the approximate gradient.
 
     Source: DIST, Algorithm 1, started on the bounding sphere (Sec. 3.2), since a network is undefined outside it.
-    Differentiable in: field parameters and rays. Unrolled: exact in the limit of many steps; too short by
-        a factor 1 - (1 - cos(angle of incidence))^steps, which matters near grazing. Its `closest` has almost no
+    Differentiable in: field parameters and rays. Unrolled: exact in the limit of many steps. Its length is 1 - (1 -
+        cos(angle of incidence))^steps times the true one, which matters near grazing. Its `closest` has almost no
         gradient at a hit, since the sample follows the surface. Approximate ("practical"): as DIST with alpha = 1.
     Needs: a distance or a bound inside the sphere.
     Deviates from the paper: a ray that starts at negative values stops at once with STARTED_INSIDE.

@@ -25,7 +25,7 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Deferred:
-    """Where a rendering sampled its `closest` values, if `closest_values` attaches their gradient.
+    """The samples of `closest` on rays without a gradient; `closest_values` evaluates them again, with a graph.
 
     Args:
         distance: along each ray to the sample.
@@ -41,7 +41,7 @@ class Volume:
     """What rays see if that is more than one hit: samples, and their weights in sums along the ray.
 
     Args:
-        ray: of each sample, the index of its ray among all rays in one row.
+        ray: of each sample, the index of its ray among the flattened rays.
         distance: along the ray to the sample, in scene units.
         weight: of the sample; the weights of a ray sum to its opacity, from 0 to 1. Differentiable.
     """
@@ -99,7 +99,7 @@ class Capabilities:
     """A renderer's capabilities.
 
     Args:
-        needs: the kinds of field that it can render.
+        needs: the kinds of field that it can render; any one suffices.
         field_gradient, ray_gradient: whether `distance` and the silhouette loss have a gradient towards the field's
             parameters and the rays; checked in `boundary`.
     """
@@ -141,7 +141,10 @@ class RayObservation:
 
 @runtime_checkable
 class Renderer(Protocol):
-    """Finds surfaces along rays. It never times, logs or draws, knows no task, and rarely waits for a GPU."""
+    """Finds surfaces along rays. It never times, logs or draws, and knows no task.
+
+    It waits for a GPU only to remove finished rays.
+    """
 
     capabilities: ClassVar[Capabilities]
 
@@ -261,7 +264,7 @@ def assemble(
     residual: Float[Tensor, " n"],
     closest: tuple[Int[Tensor, " m"], Float[Tensor, " m"]],
 ) -> Rendering:
-    """The rendering of rays of any leading shape, from tensors with one entry per ray in one row.
+    """The rendering of rays of any leading shape, from tensors with one entry per flattened ray.
 
     A field value that is not finite becomes 0 as a residual, and `NON_FINITE_VALUE` as `closest`.
 

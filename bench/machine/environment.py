@@ -50,7 +50,9 @@ def describe(device: torch.device) -> dict[str, Any]:
         "implicit_bench": version("implicit-bench") or "",
         "python": platform.python_version(),
         **{package.replace("-", "_"): version(package) for package in PACKAGES},
-        "torch": str(torch.__version__),  # includes the build; a plain str, as its class would load torch in the driver
+        "torch": str(
+            torch.__version__
+        ),  # includes the build; a plain str, as its class would load torch in the parent process
         "platform": platform.platform(),
         "cpu": cpu_name(),
         "cores": os.cpu_count(),
@@ -104,7 +106,7 @@ def flushing_denormals() -> Iterator[None]:
 def _denormals_flushed() -> bool:
     """Whether all threads of PyTorch's operations replace denormal numbers by 0."""
     bits = torch.full((NUMBERS_PER_THREAD * torch.get_num_threads(),), DENORMAL_BITS, dtype=torch.int32, device="cpu")
-    return not bool((bits.view(torch.float32) * 0.5).view(torch.int32).any())  # compared as bits, for the same reason
+    return not bool((bits.view(torch.float32) * 0.5).view(torch.int32).any())  # as bits: a comparison may flush it too
 
 
 def gemm_peak(device: torch.device, dtype: torch.dtype = torch.float32) -> float:

@@ -38,7 +38,7 @@ _delayed = False  # within `signals_delayed`
 
 @dataclass
 class RunInProgress:
-    """A run in progress, as its parent sees it.
+    """What the parent process knows of a run in progress.
 
     Args:
         record: the run's record, which the messages of the child fill.

@@ -159,7 +159,7 @@ class RunInputs:
 
 @dataclass(frozen=True)
 class RunContext:
-    """A run in progress: its inputs, its folder, its record, which is filled as it goes, and its progress report."""
+    """What a task receives: the run's inputs, its folder, its record, which the task fills, and its progress report."""
 
     inputs: RunInputs
     folder: Path
@@ -187,7 +187,7 @@ class RunContext:
 
 @runtime_checkable
 class Task(Protocol):
-    """A benchmark problem for a renderer and a scene. It names no renderer.
+    """What a run does: it solves a problem or measures a renderer. It names no renderer.
 
     A task with `takes_field = True` accepts any field set by `field=`, not only a prior's code. A task with
     `takes_one_view = True` needs no true shape.

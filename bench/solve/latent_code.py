@@ -66,13 +66,13 @@ class CodeProblem:
         penalty: on the code.
         compare: returns the weighted terms of the loss of a field at an iteration.
         observed: pixels of the scene's view whose depth is observed.
-        rays: number of rays of an iteration; with `draw`, of a drawn pixel.
+        rays: number of rays of an iteration; with `draw`, that of each drawn pixel.
         device: of all tensors.
         initial: codes, one per start; None is code zero, the mean shape.
         initial_similarities: one per start, see `renderers.field.Moved`; None does not move the shape.
         trial: see `bench.solve.optimise.StartSettings`.
         photographs: the observed photographs, for pictures.
-        progress_measure: returns the number of a field that must decrease; None: the loss must.
+        progress_measure: a function of a field whose value must fall; None: the loss must fall.
         mask, coloured: whether a mask and colours are observed, for pictures.
         draw: the pixels that each iteration compares.
         held_out: returns the weighted terms of the loss of a field on the held-out pixels of `draw`.

@@ -153,7 +153,7 @@ class ObservedView:
         return self._map_tensors(lambda tensor: tensor.to(device))
 
     def flat(self) -> "ObservedView":
-        """The same observations in one row."""
+        """The same observations, flattened."""
         return self._map_tensors(
             lambda each: (
                 Rays(each.origins.flatten(0, 1), each.directions.flatten(0, 1))
@@ -163,11 +163,11 @@ class ObservedView:
         )
 
     def select(self, rays: Int[Tensor, " n"]) -> "ObservedView":
-        """The observations of the rays with these indices, for rays in one row."""
+        """The observations of the rays with these indices, for flattened rays."""
         return self._map_tensors(lambda tensor: tensor[rays])
 
     def drawn(self, rays: Int[Tensor, " n"]) -> "ObservedView":
-        """The observations of drawn rays in one row; terms have the same weights on average as among all rays."""
+        """The observations of drawn flattened rays; terms have the same weights on average as among all rays."""
         return replace(self.select(rays), expected_observed=expected_in_draw(self.observed, len(rays)))
 
     def compare_drawn(self, draw: PixelDraw, field: Field, iteration: int) -> Terms:

@@ -27,7 +27,7 @@ HALVING_FACTOR = 4  # one start of four is kept after each round (successive hal
 SCORED_STEPS = 3  # the score of a start is its mean loss over the last steps of a round, since each sees other views
 ITERATIONS, BUDGET, HELD_OUT = "iterations", "budget", "held_out"  # what ends a loop
 HELD_OUT_INTERVAL = 5  # iterations between two measurements of the loss of held-out pixels
-HELD_OUT_PATIENCE, HELD_OUT_GAIN = 2, 0.02  # it has stopped falling if so many measurements gain less than this
+HELD_OUT_PATIENCE, HELD_OUT_GAIN = 2, 0.02
 FINAL_ITERATIONS = 10
 AFFORDED_ITERATIONS = 40  # for which `with_affordable_rays` chooses the rays
 BLOCKS = (1, 2, 4, 8)  # pixels per side of a block of which an iteration has one ray
@@ -184,8 +184,8 @@ def optimise(
 ) -> None:
     """Runs Adam on the problem's parameters.
 
-    A run that its budget ends after fewer than `MIN_BUDGET_ITERATIONS` has no result, nor one that spends nothing in as
-    many. The first loss is a warm-up. A start skips a step if its loss is NaN or its gradient not finite; others go on.
+    A run fails if its budget ends it within `MIN_BUDGET_ITERATIONS`, or if as many iterations spend nothing. The first
+    loss is a warm-up. A start skips a step if its loss is NaN or its gradient not finite; others go on.
     If one start remains, its failure ends the loop, and so does a loss far above its first one.
 
     Args:

@@ -67,11 +67,11 @@ DEFINITIONS = {
     "seconds.total": "the whole run, with making or loading shape, network and reference",
     "forward_gemm, step_gemm": "seconds that the floating-point operations take at the machine's peak rate of a matrix "
     "product, in float32 or, of coarse values, in bfloat16, over the median time",
-    "peak_memory_bytes": "highest rise of PyTorch's memory on a GPU, in a step; of no CPU, where it does not repeat",
+    "peak_memory_bytes": "highest rise of PyTorch's memory on a GPU, in a step; not measured on a CPU",
     "lost, false": "missed pixels, which only the float64 reference hits; spurious ones, which only the renderer hits",
     "behind": "share of the field values, coarse ones too, of one more rendering, untimed, that are negative: samples "
     "behind the surface (DIST, Fig. 14)",
-    "pixel_errors": "lost, false and wrong together; at the start: hits, those of an image in which nothing is hit",
+    "pixel_errors": "lost, false and wrong together; at the start, the number of hits of the reference",
     "cost": "of one rendering, in field values: a coarse one counts as an eighth",
     "rays, hits": "pixels of the image; pixels that the reference hits",
     "wrong": "pixels that both hit, at depths that differ by more than task.wrong",

@@ -248,7 +248,7 @@ class SharpenedVolume(VolumeRenderer):
 class _BatchResult:
     """For n rays: opacity, mean distance, the field's value there, and the sample with the smallest magnitude.
 
-    `ray`, `distance` and `weight` describe the samples with a weight, of all rays in one row.
+    `ray`, `distance` and `weight` describe the samples with a weight, of all flattened rays.
     """
 
     opacity: Float[Tensor, " n"]

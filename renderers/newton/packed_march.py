@@ -264,7 +264,7 @@ def march_rays(
     A coarse ray stops before its empty sphere is too small to contain the finer rays next to it.
 
     Args:
-        rays: of any leading shape; the table has them in one row.
+        rays: of any leading shape; the table has them flattened.
         stride: for rays at full resolution; coarse rays stop earlier.
         steps: maximum steps per ray, without those of its coarse rays.
         radius: of the sphere about the origin that contains the shape.

@@ -40,7 +40,7 @@ MAX_SLOPE_CHANGE = 0.05  # relative change of the slope scale, or of the slopes 
 
 @dataclass
 class CachedRays:
-    """The last rendering of n rays in one row, without a graph.
+    """The last rendering of n flattened rays, without a graph.
 
     Args:
         table: where the march left the rays.

@@ -35,13 +35,14 @@ class Stepping:
         extra_step_cap: bound on (alpha - 1) times the value, the part of a step that may pass a surface; None for none.
         step_clamp: bound on the magnitude of the value, before alpha, as in the official code; None for none.
         active_only: evaluate the field only for rays that have not finished; else for every ray that meets the sphere.
-        careful_split: a ray starts at its coarse ray's closest sample, instead of the coarse ray's end, if the surface
-            is about as close there as the two rays are to each other. Without it, rays at an edge may start behind it.
+        careful_split: a fine ray starts at the closest sample of its coarse ray, if the surface there is about as near
+            as the two rays are to each other; else at the coarse ray's end. Without it, rays at an edge may start
+            behind it.
         step_back: a step longer than the value is shortened to the value if the empty spheres about its two ends do not
             meet (Keinert et al. 2014, "Enhanced sphere tracing", Sec. 3.1), or if it would leave the bounding sphere.
             Later steps may be longer than the value again.
-        least_step: minimum length of forward steps, in scene units, except for a step that follows a step back from
-            behind the surface: such a ray would never converge. 0 for none.
+        least_step: minimum length of forward steps, in scene units; 0 for none. It does not apply after a negative
+            value, where the ray would go to and fro and never converge.
         slope: bound on the length of the field's gradient; the step length uses values divided by it.
         relaxation: weight of the last slope of the values along the ray in the running slope m. A step is then
             2 / (1 - m) times the value, instead of alpha, so that on a plane the empty spheres touch; 0 for none. It
@@ -317,7 +318,7 @@ def march_coarse_to_fine(
         radius, samples: see `RayFront.on_sphere`.
 
     Returns:
-        the front of the rays at full resolution, in one row.
+        the front of the rays at full resolution, flattened.
     """
     levels = ray_pyramid(rays)
     front = RayFront.on_sphere(levels[0].coarse, radius=radius, samples=samples)
@@ -330,7 +331,7 @@ def march_coarse_to_fine(
 
 
 class ResolutionPair(NamedTuple):
-    """Two neighbouring resolutions of an image of rays, each in one row, and the coarse ray above each fine one."""
+    """Two neighbouring resolutions of an image of rays, each flattened, and the coarse ray above each fine one."""
 
     coarse: Rays
     fine: Rays

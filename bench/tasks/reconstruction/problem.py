@@ -62,7 +62,7 @@ class ReconstructionProblem:
 
     @property
     def observed(self) -> Bool[Tensor, "1 n"]:
-        """A mask of the pixels with a given depth, of all photographs in one row."""
+        """A mask of the pixels with a given depth, of all photographs, flattened."""
         distance, colours = self.stack.pixels.distance, self.stack.pixels.colours
         return (torch.zeros_like(colours[:, 0]).bool() if distance is None else distance.isfinite())[None]
 
