@@ -220,8 +220,8 @@ def build(
     cls = find_class(node.get("_target_", target), name, [*packages, *class_package], role)
     arguments = {str(key): value for key, value in node.items() if key not in ("_target_", *MARKS)}
     argument_names = _argument_names(cls)
-    for key in (key for key, value in node.items() if value == MISSING):
-        raise ValueError(_missing_value_message(cls, name, str(key)))
+    if missing := [str(key) for key, value in node.items() if value == MISSING]:
+        raise ValueError(_missing_value_message(cls, name, missing[0]))
     for key in arguments:
         if argument_names is not None and key not in argument_names:
             is_foreign = name == "renderer" and not is_custom and cls.__module__.partition(".")[0] not in OUR_PACKAGES

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 
@@ -135,19 +135,18 @@ class Completion:
         holds_out, last = self.optimiser.ends == HELD_OUT, self.optimiser.iterations
         draw = PixelDraw(observed_view.observed, self.pixel_block, scene.seed(seed), holds_out=holds_out)
         compare = partial(observed_view.compare_drawn, draw)
-        problem = partial(
-            self.problem_class, prior, self.code, compare, compared, scene.rays_per_pixel, device, draw=draw
-        )
+        options: dict[str, Any] = {"draw": draw, "mask": observed_view.mask is not None}
+        options["coloured"] = self.colour_weight > 0
         if holds_out or self.pixel_block > 1 or scene.rays_per_pixel > 1:
-            problem = partial(problem, progress_measure=lambda field: float(total(observed_view.compare(field, last))))
+            options["progress_measure"] = lambda field: float(total(observed_view.compare(field, last)))
         if holds_out:
             held_out = observed_view.flat().drawn(draw.held_out.to(device))
-            problem = partial(problem, held_out=lambda field: held_out.compare(field, last))
-        problem = partial(problem, mask=observed_view.mask is not None, coloured=self.colour_weight > 0)
-        if not self.similarity:
-            return problem()
-        codes = torch.zeros(self.rotations, prior.decoder.code_length)
-        return problem(initial=codes, initial_similarities=initial_rotations(self.rotations), trial=self.trial)
+            options["held_out"] = lambda field: held_out.compare(field, last)
+        if self.similarity:
+            options["initial"] = torch.zeros(self.rotations, prior.decoder.code_length)
+            options |= {"initial_similarities": initial_rotations(self.rotations), "trial": self.trial}
+        rays = scene.rays_per_pixel
+        return self.problem_class(prior, self.code, compare, compared, rays, device, **options)
 
     def _observed_view(self, scene: Scene, renderer: Renderer, *, seed: int, device: torch.device) -> ObservedView:
         """The observed part of a scene's view."""
