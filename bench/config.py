@@ -221,7 +221,7 @@ def build(
     arguments = {str(key): value for key, value in node.items() if key not in ("_target_", *MARKS)}
     argument_names = _argument_names(cls)
     if missing := [str(key) for key, value in node.items() if value == MISSING]:
-        raise ValueError(_missing_value_message(cls, name, missing[0]))
+        raise ValueError(_missing_values_message(cls, name, missing))
     for key in arguments:
         if argument_names is not None and key not in argument_names:
             is_foreign = name == "renderer" and not is_custom and cls.__module__.partition(".")[0] not in OUR_PACKAGES
@@ -252,7 +252,9 @@ def find_class(path: Any, name: str, packages: Sequence[str], role: type | None)
     try:
         cls = getattr(import_module(module), class_name)
     except Exception as error:  # a module of the user may raise any error
-        raise ValueError(f"{name}._target_ names {path!r}, which cannot be imported: {error}") from error
+        is_absent = isinstance(error, ModuleNotFoundError) and error.name == package
+        remedy = "; add its folder to PYTHONPATH, or start there" if is_absent else ""
+        raise ValueError(f"{name}._target_ names {path!r}, which cannot be imported: {error}{remedy}") from error
     if not isinstance(cls, type):
         raise ValueError(f"{name}._target_ names {path!r}, which is no class: name the class of a component")
     if role is None and name in ROLE_OF_NODE:
@@ -269,6 +271,8 @@ def custom_renderer_hint(path: str) -> str:
 
 def _role_fault(cls: type, role: type) -> str:
     """Why a class does not fill a role; empty if it does. Data attributes are not checked: __init__ may set them."""
+    if abstract := sorted(getattr(cls, "__abstractmethods__", ())):
+        return f"it does not define {', '.join(abstract)}: see {role.__module__}"
     if not getattr(role, "_is_protocol", False):
         return "" if issubclass(cls, role) else f"name a class that extends {_class_path(role)}"
     protocols = [base for base in role.__mro__ if getattr(base, "_is_protocol", False) and base is not Protocol]
@@ -367,21 +371,28 @@ def _build_dataclass(cls: type, arguments: dict[str, Any], name: str, packages: 
     for key, child in nested.items():
         target = _class_path(child) if child else ""
         values[key] = build(arguments[key], f"{name}.{key}", packages, target, role=child or _protocol(types[key]))
-    for item in fields(cls):
-        has_default = item.default is not dataclasses.MISSING or item.default_factory is not dataclasses.MISSING
-        if item.name not in values and not has_default:
-            raise ValueError(_missing_value_message(cls, name, item.name))
+    defaults = {item.name: {item.default, item.default_factory} != {dataclasses.MISSING} for item in fields(cls)}
+    if missing := [key for key, has_default in defaults.items() if key not in values and not has_default]:
+        is_foreign = name == "renderer" and cls.__module__.partition(".")[0] not in OUR_PACKAGES
+        raise ValueError(_missing_values_message(cls, name, missing, plus="+" if is_foreign else ""))
     try:
         return cls(**values)
     except ValueError as error:  # the class of a nested node does not know its key
         raise error if "." not in name or name in str(error) else ValueError(f"{name}: {error}") from error
 
 
-def _missing_value_message(cls: type, name: str, key: str) -> str:
-    """The error message for a key without a value, with the description from the docstring of its class."""
+def _missing_values_message(cls: type, name: str, keys: Sequence[str], plus: str = "") -> str:
+    """The error message for keys without a value, with the description of the first one from the class's docstring.
+
+    Args:
+        plus: of an override of a key that no YAML has.
+    """
+    key = keys[0]
     match = re.search(rf"^( *){re.escape(key)}: (.+?)(?=^\1\S|^$|\Z)", getdoc(cls) or "", re.MULTILINE | re.DOTALL)
     explanation = f", {' '.join(match[2].split()).rstrip('.')}" if match else ""
-    return f"{name}.{key} must be given: set {name}.{key}=...{explanation}"
+    settings = " ".join(f"{plus}{name}.{each}=..." for each in keys)
+    default = "; or give it a default in the class" if plus else ""
+    return f"{' and '.join(f'{name}.{each}' for each in keys)} must be given: set {settings}{explanation}{default}"
 
 
 def _node_class(wanted: Any) -> type | None:

@@ -203,10 +203,10 @@ class SurfaceRenderer(ABC):
         sphere_radius: of the sphere about the origin that contains the shape.
     """
 
-    least_slope: float
-    mask_sharpness: float
-    mask_weight: float
-    sphere_radius: float
+    least_slope: float = 1e-3
+    mask_sharpness: float = 50.0
+    mask_weight: float = 100.0
+    sphere_radius: float = 1.0
 
     capabilities: ClassVar[Capabilities] = DISTANCE_CAPABILITIES
 

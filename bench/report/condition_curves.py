@@ -82,6 +82,7 @@ class ConditionCurves:
             question=self.question,
             verdict=self._verdict(compared),
             interval="95 % intervals over shapes (of the sign test)",
+            estimates=[line["estimates"][self.measures[0].key] for line in lines],
             remarks=[*self.notes(runs), NOTE],
             columns=self._columns(),
             lines=lines,
@@ -139,6 +140,8 @@ class ConditionCurves:
 
     def _verdict(self, ratios: dict[str, statistics.Interval]) -> str:
         """The significant ratios, and the number of others."""
+        if not ratios:
+            return f"No ratio at {self.heading.lower()} {self.compared:g}: no row has it with a row to compare it with."
         verdicts = dict(zip(ratios, statistics.ratio_verdicts([*ratios.values()]), strict=True))
         differ = [name for name, verdict in verdicts.items() if verdict is statistics.Verdict.DIFFERS]
         parts = [f"{name} *{format.number(ratios[name].value)}*" for name in differ]
@@ -150,7 +153,7 @@ class ConditionCurves:
             else:
                 parts = [f"{name} *{format.number(ratio.value)}*, {reason}" for name, ratio in ratios.items()]
         shapes = sorted({len(ratio.points) for ratio in ratios.values()})
-        return f"{self.verdict}: {'; '.join(parts)}; n = {' or '.join(map(str, shapes))} shapes." if ratios else ""
+        return f"{self.verdict}: {'; '.join(parts)}; n = {' or '.join(map(str, shapes))} shapes."
 
     def _panel(self, lines: list[Line], measure: Measure) -> chart.Panel:
         rows: dict[tuple[str, str], list[Line]] = {}

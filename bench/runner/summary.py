@@ -73,10 +73,12 @@ def print_statuses(plan: Plan) -> list[str]:
 
 
 def _print_contract_test(runs: Path, records: Sequence[Mapping[str, Any]]) -> None:
-    """Prints the command of the contract test, if the results folder had no runs of `renderer=custom` before."""
-    new_runs = {record["id"]: record["config"] for record in records if record["renderer"] == CUSTOM_RENDERER}
-    if new_runs and {path.parent.name for path in runs.glob(f"*-{CUSTOM_RENDERER}-*/record.json")} <= {*new_runs}:
-        target = next(iter(new_runs.values()))["renderer"]["_target_"]
+    """Prints the command of the contract test after the first runs of `renderer=custom`, and after one that failed."""
+    custom = {record["id"]: record for record in records if record["renderer"] == CUSTOM_RENDERER}
+    has_failed = any(record["status"] != "ok" for record in custom.values())
+    all_runs = {path.parent.name for path in runs.glob(f"*-{CUSTOM_RENDERER}-*/record.json")}
+    if custom and (has_failed or all_runs <= {*custom}):
+        target = next(iter(custom.values()))["config"]["renderer"]["_target_"]
         print(f"does the renderer hold its contract? in a clone: {CONTRACT_TEST}{shlex.quote(target)}")
 
 

@@ -35,8 +35,9 @@ from datasets.scene import (
 )
 from datasets.views import ViewSampler
 from renderers.checks import BadInput
-from renderers.rendering import Renderer, final_notes
+from renderers.rendering import Capabilities, Renderer, final_notes
 
+RENDERER_ATTRIBUTES = ("capabilities", "render", "silhouette_loss")
 MIN_MULTITHREADED_WIDTH = 256  # neurons per layer: a narrower network is evaluated by one thread
 DEFAULT_THREADS = torch.get_num_threads()  # PyTorch's choice
 Node = Mapping[str, Any]  # of a configuration
@@ -269,8 +270,15 @@ class _Builder:
         node, notes = auto.resolve(requested, view) if AUTO in requested.values() else (requested, [])
         (renderer,) = self.parts(renderer=node)
         if not isinstance(renderer, Renderer):
-            lacking = f"renderer {type(renderer).__name__} lacks capabilities, render or silhouette_loss"
-            raise ValueError(f"{lacking}: see renderers/rendering.py")
+            lacking = [name for name in RENDERER_ATTRIBUTES if not hasattr(renderer, name)]
+            raise ValueError(
+                f"renderer {type(renderer).__name__} lacks {', '.join(lacking)}: see renderers/rendering.py"
+            )
+        if not isinstance(renderer.capabilities, Capabilities):
+            kind = type(renderer.capabilities).__name__
+            raise ValueError(
+                f"capabilities of the renderer {type(renderer).__name__} must be a Capabilities, not a {kind}"
+            )
         return renderer, notes
 
     def prior(self, dataset: Dataset, split: Split, index: int) -> PriorChoice:

@@ -173,7 +173,8 @@ def read_capture(folder: Path, settings: ReadSettings) -> Capture:
     """
     layout = find_layout(folder, settings.images, masks=settings.masks)
     if len(layout.frames) < MIN_PHOTOS:
-        raise BadInput(f"{folder} has {len(layout.frames)} photographs with cameras: {MIN_PHOTOS} or more are needed")
+        count = f"{len(layout.frames)} photograph{'s' if len(layout.frames) > 1 else ''} with cameras"
+        raise BadInput(f"{folder} has {count}: {MIN_PHOTOS} or more are needed")
     try:
         capture, doubts = _check_fit(_capture(layout, settings), layout, settings)
     except UnfitCameras as error:
@@ -198,7 +199,7 @@ def _capture(layout: Layout, settings: ReadSettings) -> Capture:
         raise UnfitCameras("; ".join([str(error), *exif])) from None
     largest = max(max(shot.camera.height, shot.camera.width) for shot in shots)
     longest = settings.longest
-    size_note = (f"the photographs have at most {largest} pixels, not {longest}",) if largest < longest else ()
+    size_note = (f"the photographs have at most {largest} pixels per side, not {longest}",) if largest < longest else ()
     source = "files" if frames[0].mask is not None else "the alpha channel"
     to_world = np.diag([*[sphere.radius] * 3, 1.0])
     to_world[:3, 3] = sphere.centre

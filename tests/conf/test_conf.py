@@ -292,13 +292,35 @@ def test_the_practical_gradient_of_naive_asks_for_its_number_of_samples(compose_
     assert build_part(compose_config(*practical, "renderer.n_gradient_samples=2"), "renderer").n_gradient_samples == 2
 
 
+FAULTY_CLASSES = """
+import abc, dataclasses
+
+class Abstract(Mine, abc.ABC):
+    @abc.abstractmethod
+    def render(self, field, rays): ...
+
+@dataclasses.dataclass
+class TwoSettings(Mine):
+    size: int
+    more: float
+"""
+
+
 def test_a_user_renderer_needs_only_its_class(compose_config, tmp_path, monkeypatch):
-    (tmp_path / "mypkg_of_mine.py").write_text(CLASS)
+    (tmp_path / "mypkg_of_mine.py").write_text(CLASS + FAULTY_CLASSES)
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ValueError, match=r"renderer\._target_ must be given"):
         load("renderer", "custom")
     with pytest.raises(ValueError, match=r"names 'mypkg_of_mine\.Yours', which cannot be imported"):
         build_part(compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Yours"), "renderer")
+    with pytest.raises(ValueError, match="No module named 'no_such_package'; add its folder to PYTHONPATH"):
+        load("renderer", "custom", _target_="no_such_package.Mine")
+    with pytest.raises(
+        ValueError, match=r"size and renderer\.more must be given: set \+renderer\.size=\.\.\. \+renderer\.more"
+    ):
+        load("renderer", "custom", _target_="mypkg_of_mine.TwoSettings")
+    with pytest.raises(ValueError, match="it does not define render: see renderers"):
+        load("renderer", "custom", _target_="mypkg_of_mine.Abstract")
     config = compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Mine", "+renderer.size=3")
     built, loaded = build_part(config, "renderer"), load("renderer", "custom", _target_="mypkg_of_mine.Mine", size=3)
     assert (type(built).__name__, built.size) == (type(loaded).__name__, loaded.size) == ("Mine", 3)

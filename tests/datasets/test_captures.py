@@ -131,7 +131,7 @@ def test_a_world_far_from_the_origin_is_read_exactly(tmp_path, away):
 def test_photographs_are_reduced_with_their_cameras_and_never_enlarged(tmp_path):
     nerf(tmp_path)
     small, large = (read_capture(tmp_path, ReadSettings(longest)) for longest in (24, 4096))
-    assert large.notes == ("the photographs have at most 48 pixels, not 4096",) and small.notes == ()
+    assert large.notes == ("the photographs have at most 48 pixels per side, not 4096",) and small.notes == ()
     assert small.shots[0].colours.shape == (20, 24, 3) and large.shots[0].colours.shape == (*SIZE, 3)
     torch.testing.assert_close(small.shots[0].camera.intrinsics[:2], large.shots[0].camera.intrinsics[:2] / 2)
     assert large.shots[0].colours[0, 0].tolist() == [1.0, 1.0, 1.0]  # transparent is white

@@ -55,6 +55,10 @@ def test_a_row_is_compared_with_itself_at_the_first_value(monkeypatch):
     assert "n = 8 shapes" in verdict
 
 
+def test_a_page_says_that_no_row_has_the_compared_value():
+    assert "No ratio at key 4" in page()._verdict({})
+
+
 def test_rows_are_compared_with_the_reference_on_common_shapes():
     made = runs_of({("A", 4): 2.0, ("B", 4): 1.0})
     frame = made.frame.assign(value=made.frame["config.key"])

@@ -80,6 +80,8 @@ def test_a_mistyped_metric_is_an_error_with_the_nearest_name(tmp_path):
     runs = choose(read_records(tmp_path)[0], Selection("mine"), tmp_path)
     with pytest.raises(ValueError, match=r"no run of the experiment mine has a metric 'hist': did you mean hits\?"):
         runs.number("hist")
+    with pytest.raises(ValueError, match=r"has a setting 'task\.pionts'"):
+        runs.number("config.task.pionts")
     with pytest.raises(ValueError, match=r"did you mean hits\?"):
         Result(runs, "T.", "P.", columns=[table.metric("hist", "Pixels")], lines=runs.records)
 

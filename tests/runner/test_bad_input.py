@@ -56,7 +56,7 @@ def assert_one_line(err: str, *words: str) -> None:
     ("dataset=meshes/cow.obj", ("unknown dataset 'meshes/cow.obj'", "dataset=mesh dataset.path=meshes/cow.obj")),
     ("+sede=1", ("unknown key 'sede'", "did you mean seed")),
     ("xyzzy=1", ("unknown key 'xyzzy': none of ", "--cfg job shows them")),
-    ("+experiment=fig10", ("unknown experiment 'fig10'", "fig10_focal", "fig10_start")),
+    ("+experiment=fig10", ("unknown experiment 'fig10'", "fig10_focal", "fig10_start", "--config-dir FOLDER")),
     ("task.iterations=3", ("unknown key 'task.iterations'", "task.optimiser.iterations")),
     ("seed=x", ("seed must be a whole number, not 'x'",)),
     ("verbose=maybe", ("verbose must be true or false, not 'maybe'",)),

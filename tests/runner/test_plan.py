@@ -271,8 +271,10 @@ def test_an_experiment_without_m_says_that_it_is_one_run(tmp_path):
 
 def test_a_class_that_raises_another_error_is_left_to_its_run_and_prints_nothing(plain, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(tmp_path)
-    lacks = "renderer Mine lacks capabilities, render or silhouette_loss: see renderers/rendering.py"
+    lacks = "renderer Mine lacks capabilities: see renderers/rendering.py"
+    is_dict = "capabilities of the renderer Mine must be a Capabilities, not a dict"
     acts = {"raise RuntimeError": "", "raise SystemExit(3)": "", "raise ValueError('no')": "no", "print('made')": lacks}
+    acts["self.capabilities = {}"] = is_dict
     for number, (act, words) in enumerate(acts.items()):
         module = f"acting_{number}_{tmp_path.name}"
         (tmp_path / f"{module}.py").write_text(CODE.format(act=act))

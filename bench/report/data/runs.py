@@ -131,8 +131,12 @@ class Runs:
         """Raises ValueError if runs have metrics, but none of this name, and the name is no metric of this project."""
         names = list(dict.fromkeys(key for run in self.records for key in run["metrics"]))
         if names and name not in self.frame and not better_direction(name) and name not in MEASUREMENT_METRICS:
+            is_setting, key = name.startswith("config."), name.removeprefix("config.")
+            if is_setting:
+                names = [column.removeprefix("config.") for column in self.frame if column.startswith("config.")]
+            kind = "setting" if is_setting else "metric"
             raise ValueError(
-                f"no run of the experiment {self.selection.experiment} has a metric {name!r}{nearest(name, names)}"
+                f"no run of the experiment {self.selection.experiment} has a {kind} {key!r}{nearest(key, names)}"
             )
 
     @property

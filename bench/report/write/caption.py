@@ -127,7 +127,10 @@ def _omitted(runs: Runs) -> str:
 
 def _renamed(runs: Runs) -> str:
     rows = [f"{row} ({_listed(keys)})" for row, keys in runs.renamed.items()]
-    remedy = "Only the settings requested last are shown: run each setting with another label=NAME"
+    remedy = (
+        "Only the settings requested last are shown: run each setting with another label=NAME. In a study of your own, "
+    )
+    remedy += "name such a key in its Selection"
     return f"Several settings have the same label: {_listed(rows)}. {remedy}." if rows else ""
 
 
