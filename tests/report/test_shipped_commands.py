@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
 
 from bench.records.record import flat, row_name
 from bench.records.shipped import SUFFIX
 from bench.report.data.kept import read_rows
 from bench.report.write.paper import FOLDER, SHIPPED
-from bench.tables import CONF
+from bench.tables import choice, names
 from tests.composing import cells_of
 from tests.documentation import text_of
 
@@ -41,8 +40,7 @@ def planned(experiment: str, at_most: int | None = None) -> list[tuple[tuple[str
     found = []
     for command in dict.fromkeys(command for of in commands for command in of):
         name, *words = shlex.split(command)
-        file = CONF / "experiment" / f"{name}.yaml"
-        if not file.exists() or OmegaConf.load(file).get("experiment") != experiment:
+        if name not in names("experiment") or choice("experiment", name).get("experiment") != experiment:
             continue
         cells = cells_of(f"+experiment={name}", *words, at_most=at_most)
         found += [described(cell.config, cell.dataset, cell.renderer) for cell in cells]
