@@ -156,6 +156,16 @@ def quick_pages() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def without_shipped(tmp_path_factory) -> Iterator[None]:
+    """A report shows the user's own tables alone; reading those that a checkout ships takes half a second."""
+    from bench.report.write import paper
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper, "SHIPPED", tmp_path_factory.getbasetemp() / "none")
+        yield
+
+
 @pytest.fixture(scope="module")
 def few_samples() -> Iterator[None]:
     """Compares the frames of two surfaces by fewer points."""

@@ -9,8 +9,6 @@ from typing import Any
 
 import pytest
 
-from tests.report.conftest import without_shipped  # noqa: F401
-
 FLAGS = (
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync"),

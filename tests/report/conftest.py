@@ -7,7 +7,6 @@ import pytest
 
 from bench.pictures import figure_style
 from bench.report.__main__ import main
-from bench.report.write import paper
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -27,11 +26,3 @@ def reported(tmp_path_factory) -> Path:
     write_run(results, "table1", DYNAMIC, metrics=costs())
     main([f"results_dir={results}"])
     return results
-
-
-@pytest.fixture(scope="session", autouse=True)
-def without_shipped(tmp_path_factory) -> Iterator[None]:
-    """A report shows the user's own tables alone, not those that a checkout ships."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper, "SHIPPED", tmp_path_factory.getbasetemp() / "none")
-        yield

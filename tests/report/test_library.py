@@ -7,7 +7,7 @@ import bench
 from bench.report.write import paper
 from tests.report.test_report_sweeps import cell, ran
 
-SHIPPED = paper.SHIPPED  # before tests/report/conftest.py replaces it
+SHIPPED = paper.SHIPPED  # before tests/conftest.py replaces it
 
 
 @pytest.fixture
