@@ -20,7 +20,7 @@ from bench.report.data import records
 from bench.report.data.kept import UNFINISHED
 from bench.report.data.records import Record, RunKey, by_shape, definitions, error, grouped, measured, run_key
 from bench.report.data.runs import Runs, Selection
-from bench.report.data.statistics import Interval, bootstrap, median, paired_bootstrap, share
+from bench.report.data.statistics import Interval, bootstrap, median, ratio, share
 from bench.report.suite.attempts import portable_overrides
 from bench.report.write import chart
 from bench.report.write.caption import FEW, VARYING
@@ -49,6 +49,7 @@ SMALL_POINTS = (
     "Costs are medians over runs that ended ok."
 )
 FRONT = "Grey steps: the front, of the rows for which no other is both cheaper and better."
+RATIO = "A ratio is the median of the ratios on the same shapes. Its interval is of the sign test."
 UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
 
 
@@ -213,11 +214,11 @@ def _middle(values: dict[RunKey, float]) -> Interval:
 
 
 def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | None:
-    """The ratio of medians to those of the first row on the same shapes and seeds; None for the first row itself."""
+    """The ratio of errors to those of the first row on the same shapes and seeds; None for the first row itself."""
     mine, theirs = ({run_key(run): error(run, metric) for run in row} for row in (runs, first))
     if not metric or runs is first or set(mine) != set(theirs):
         return None
-    return paired_bootstrap(by_shape(mine), by_shape({key: theirs[key] for key in mine}), median)
+    return ratio(by_shape(mine), by_shape({key: theirs[key] for key in mine}))
 
 
 def table_of(sweep: Sweep) -> Result:
@@ -227,6 +228,7 @@ def table_of(sweep: Sweep) -> Result:
     stress = any(record["config"].get("stress") for record in sweep.runs.records)
     csv_only = [name for name in names if name not in headings]
     has_interval = [line[name].has_ends for line in table_lines for name in headings if line[name] is not None]
+    has_ratio = any(line["ratio"] is not None for line in table_lines)
     kinds = ["95 % bootstrap intervals over shapes" if any(has_interval) else ""]
     kinds += [] if all(has_interval) else [f"{FEW}: no interval"]
     lead = names[0] if names and names[0] in headings and better_direction(names[0]) else ""
@@ -253,11 +255,12 @@ def table_of(sweep: Sweep) -> Result:
             SMALL_POINTS if panels else "",
             FAILURE,
             f"Left out: {sweep.missing} that were not run; the same command runs them." if sweep.missing else "",
+            RATIO * has_ratio,
             UNDIRECTED if any(not better_direction(name) for name in headings) else "",
             f"The CSV also has {', '.join(csv_only)}." if csv_only else "",
             *definitions(sweep.runs.records, {name: metric.label for name, metric in headings.items()}),
         ),
-        columns=_columns(sweep, headings, several=any(line["ratio"] is not None for line in table_lines)),
+        columns=_columns(sweep, headings, several=has_ratio),
         lines=table_lines,
     )
 
@@ -369,13 +372,13 @@ def _failed(line: dict[str, Any]) -> str:
 
 def _columns(sweep: Sweep, headings: dict[str, Metric], *, several: bool) -> list[Column]:
     names, first = sweep.metrics, next(iter(headings.values()), Metric(""))
-    ratio = Metric(f"{first.label.split(' (')[0]}, ratio to the first row" if several else "")
+    to_first = Metric(f"{first.label.split(' (')[0]}, ratio to the first row" if several else "")
     labels = {_on(names[0], dataset): f"{dataset}: {first.label}" for dataset in sweep.datasets if names}
     return [
         text("row", "Row"),
         *(column for name, label in labels.items() for column in _estimate(name, first._replace(label=label))),
         *(column for name in names for column in _estimate(name, headings.get(name, Metric("")))),
-        *_estimate("ratio", ratio),
+        *_estimate("ratio", to_first),
         Column("runs"),
         Column("failed", "Failed", words=_failed),
         *ends("failed", lambda line: line["rate"]),

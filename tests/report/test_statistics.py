@@ -14,7 +14,6 @@ from bench.report.data.statistics import (
     front,
     interquartile_mean,
     median,
-    paired_bootstrap,
     rank,
     ratio,
     ratio_verdicts,
@@ -114,11 +113,7 @@ def test_of_six_shapes_an_interval_leaves_out_a_quarter_of_a_per_cent_of_draws_o
 @each("n", [1, 4, 5])
 def test_fewer_than_six_shapes_have_points_and_no_interval(n):
     groups = [np.array([i, i + 2.0]) for i in range(n)]
-    for found in (
-        bootstrap(groups, mean, seed=0),
-        paired_bootstrap(groups, groups, mean, seed=0),
-        share(np.ones(n), 2 * np.ones(n)),
-    ):
+    for found in (bootstrap(groups, mean, seed=0), share(np.ones(n), 2 * np.ones(n))):
         assert math.isnan(found.low) and math.isnan(found.high) and not found.has_ends and len(found.points) == n
         assert str(found).endswith(f" (n = {n})")
     found = bootstrap(groups, mean, seed=0)
@@ -157,32 +152,13 @@ def test_failures_make_infinite_ends(average):
     assert uneven.low < 3 and uneven.high == INF
 
 
-def test_paired_ratio_of_failures():
-    good, bad = singles(1, 2, 3, 4, 5, 6), singles(*[INF] * 6)
-    for first, second, expected in ((bad, bad, 1), (bad, good, INF), (good, bad, 0), (good, good, 1)):
-        assert paired_bootstrap(first, second, median, seed=0) == Interval(expected, expected, expected)
-    zero = singles(*[0] * 6)
-    assert paired_bootstrap(zero, zero, median, seed=0).value == 1
-    assert paired_bootstrap(good, zero, median, seed=0).low == INF
-
-
-def test_pairing_narrows_the_interval():
-    generator = np.random.default_rng(0)
-    shapes = np.exp(1.5 * generator.normal(size=(16, 1)))
-    first, second = (list(shapes * np.exp(0.1 * generator.normal(size=(16, 3)))) for _ in range(2))
-    paired = paired_bootstrap(first, second, interquartile_mean, seed=0)
-    mixed = paired_bootstrap(first, second[::-1], interquartile_mean, seed=0)  # the same errors of other shapes
-    assert paired.value == pytest.approx(mixed.value)
-    assert 5 * math.log(paired.high / paired.low) < math.log(mixed.high / mixed.low)
-
-
 def test_bad_groups():
     for groups in ([], [np.ones(2), np.ones(0)], [np.array([1.0, math.nan])]):
         with pytest.raises(ValueError, match="must"):
             bootstrap(groups, median, seed=0)
     for other in (singles(1, 2), [np.ones(1), np.ones(2), np.ones(1)]):
         with pytest.raises(ValueError, match="same shapes and seeds"):
-            paired_bootstrap(singles(1, 2, 3), other, median, seed=0)
+            front([(singles(1, 2, 3), other)])
 
 
 @each("successes, n", [(0, 10), (3, 10), (10, 10), (1, 1), (17, 400)])

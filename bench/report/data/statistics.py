@@ -215,20 +215,6 @@ def _median_interval(points: np.ndarray) -> Interval:
     return Interval(middle, float(ordered[beyond]), float(ordered[-1 - beyond]), tuple(points.tolist()))
 
 
-def paired_bootstrap(
-    first: Groups, second: Groups, statistic: Statistic, *, seed: int = 0, draws: int = 2000
-) -> Interval:
-    """The ratio of the first's statistic to the second's, with its interval over the same draws of both.
-
-    Equal statistics have the ratio 1, also if both are +inf or 0: if both fail, neither is better.
-
-    Raises:
-        ValueError: the two do not have the same shapes with the same numbers of views and seeds.
-    """
-    value, drawn, points = _resample([first, second], statistic, seed, draws)
-    return _interval(_ratio(*value), _ratio(*drawn), _ratio(*points))
-
-
 def share(successes: Values, trials: Values) -> Interval:
     """The fraction of successes among all trials of all shapes, with an interval over shapes.
 
