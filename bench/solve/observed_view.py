@@ -190,7 +190,7 @@ class ObservedView:
         if self.colours is not None:
             terms["colour"] = self.colour_weight * self._colour_error(field, rendering)
         if self.mask is not None:
-            terms["silhouette"] = self.silhouette_term(renderer, field, rendering, self.mask)
+            terms["silhouette"] = self.silhouette_term(renderer, field, rendering)
         return terms
 
     def depth_term(self, rendering: Rendering) -> tuple[Float[Tensor, ""], Bool[Tensor, "*rays"]]:
@@ -204,13 +204,11 @@ class ObservedView:
         count = observed_hits(hit, self.observed, self.expected_observed)
         return self.settings.depth_weight * (error * compared).sum() / count, compared
 
-    def silhouette_term(
-        self, renderer: Renderer, field: Field, rendering: Rendering, mask: Bool[Tensor, "*rays"]
-    ) -> Float[Tensor, ""]:
+    def silhouette_term(self, renderer: Renderer, field: Field, rendering: Rendering) -> Float[Tensor, ""]:
         """The weighted silhouette loss."""
         distance = torch.where(self.observed, self.depth / self.depth_per_distance, torch.nan)
         if self.covered is None:
-            observation = RayObservation(mask, distance)
+            observation = RayObservation(self.mask, distance)
         else:
             observation = observation_of(self.covered, distance, rendering)
         loss = self.settings.silhouette(renderer, field, self.rays, rendering, observation)

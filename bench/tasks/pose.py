@@ -279,7 +279,7 @@ class PoseProblem:
         renderer = at_iteration(self.renderer, step)
         rendering = render_checked(renderer, shape, view.rays)
         depth, compared = view.depth_term(rendering)
-        terms = {"depth": depth, "silhouette": view.silhouette_term(renderer, shape, rendering, view.observed)}
+        terms = {"depth": depth, "silhouette": view.silhouette_term(renderer, shape, rendering)}
         if self.settings.normal_weight:
             rendered_normals = in_camera_axes(autograd_normals(shape, rendering.points[compared].detach()), camera)
             terms["normals"] = self.settings.normal_weight * normal_error(rendered_normals, normals[compared])
