@@ -225,6 +225,13 @@ def _exact_distances(
     return radius * truth.distance((points - centre) / radius)
 
 
+def points_in_sphere(points: Float[np.ndarray, "n 3"], to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "m 3"]:
+    """Transforms points of the file's world to the unit sphere's world, and keeps those inside the sphere."""
+    to_sphere = np.linalg.inv(to_world)
+    moved = points @ to_sphere[:3, :3].T + to_sphere[:3, 3]
+    return moved[np.linalg.norm(moved, axis=1) <= 1]
+
+
 def compare_outlines(
     shape: Mesh | Float[np.ndarray, "n 3"], shots: Sequence[Shot], to_world: Float[np.ndarray, "4 4"]
 ) -> Comparison:
@@ -236,15 +243,11 @@ def compare_outlines(
         shots: photographs with masks, of the unit sphere; points outside of it are left out.
         to_world: from the unit sphere to the world of the file.
     """
-    to_sphere, points = np.linalg.inv(to_world), samples_of(shape) if isinstance(shape, Mesh) else shape
+    points = samples_of(shape) if isinstance(shape, Mesh) else shape
     points = points[np.random.default_rng(0).permutation(len(points))]
 
-    def inside(world_points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-        moved = world_points @ to_sphere[:3, :3].T + to_sphere[:3, 3]
-        return moved[np.linalg.norm(moved, axis=1) <= 1]
-
-    cut = shape.moved(to_sphere).cut_off() if isinstance(shape, Mesh) else None
-    unchanged = inside(points) if cut is None or not cut.area else samples_of(cut)
+    cut = shape.moved(np.linalg.inv(to_world)).cut_off() if isinstance(shape, Mesh) else None
+    unchanged = points_in_sphere(points, to_world) if cut is None or not cut.area else samples_of(cut)
 
     def seen_by(count: int, samples: int, side: int) -> Misfit:
         chosen = [shots[i] for i in np.linspace(0, len(shots) - 1, min(count, len(shots))).round().astype(int)]
@@ -256,7 +259,7 @@ def compare_outlines(
         changed_views = views(min(samples, len(points)))
 
         def misfit(change: Change) -> float:
-            moved, compared = inside(change.apply(points[:samples])), changed_views
+            moved, compared = points_in_sphere(change.apply(points[:samples]), to_world), changed_views
             if change is IDENTITY:
                 moved = unchanged[:samples]
                 compared = views(len(moved))

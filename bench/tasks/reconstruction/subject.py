@@ -17,7 +17,7 @@ from bench.tasks.reconstruction.dtu import DEFINITIONS as DTU_DEFINITIONS
 from bench.tasks.reconstruction.dtu import DtuScan, dtu_metrics, published_results, read_scan
 from datasets.files.captures.hull import hull_mesh
 from datasets.files.captures.sphere import in_world
-from datasets.files.coincidence import compare_outlines, settled
+from datasets.files.coincidence import compare_outlines, points_in_sphere, settled
 from datasets.files.meshes import read_pieces, read_points
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.photographs import Photography
@@ -263,13 +263,6 @@ def outline_notes(
         "the units of the cameras"
     )
     return [*settled(comparison, doubt, unchecked=dataset.unchecked)]
-
-
-def points_in_sphere(points: Float[np.ndarray, "n 3"], to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "m 3"]:
-    """Transforms points of the file's world to the unit sphere's world, and keeps those inside the sphere."""
-    to_sphere = np.linalg.inv(to_world)
-    moved = points @ to_sphere[:3, :3].T + to_sphere[:3, 3]
-    return moved[np.linalg.norm(moved, axis=1) <= 1]
 
 
 def given_distances(shots: Sequence[Shot]) -> list[Float[torch.Tensor, "_ _"]]:

@@ -10,7 +10,8 @@ from scipy.ndimage import map_coordinates
 
 from bench.evaluate.colours import DEFAULT_VERTEX_COLOUR, render_vertex_colours
 from bench.tasks.reconstruction.stereo import Cloud, allowed_by_mask
-from bench.tasks.reconstruction.subject import Subject, points_in_sphere, visible
+from bench.tasks.reconstruction.subject import Subject, visible
+from datasets.files.coincidence import points_in_sphere
 from datasets.files.meshes import read_points
 from datasets.files.repair import require_meshlab
 from datasets.mesh import Mesh
