@@ -16,6 +16,13 @@ def ball(radius: float = RADIUS, centre=CENTRE, subdivisions: int = 4) -> Mesh:
     return icosphere(radius, centre, subdivisions)
 
 
+def solid() -> Mesh:
+    """An ellipsoid with a knob, without any symmetry."""
+    ellipsoid, knob = ball(1.0, (0, 0, 0)), ball(0.25, (0.6, 0.35, 0.2))
+    vertices = np.concatenate([ellipsoid.vertices * (1.0, 0.6, 0.35), knob.vertices])
+    return Mesh(vertices, np.concatenate([ellipsoid.faces, knob.faces + len(ellipsoid.vertices)]))
+
+
 def write_dtu(folder: Path, points: np.ndarray, *, reach: float = 25.0, plane=(0, 0, 1, -590), centre=CENTRE):
     """Writes a scan whose observed cells of 2 mm are those within `reach` of the centre."""
     for name in ("Points/stl", "ObsMask"):

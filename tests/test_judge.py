@@ -19,7 +19,7 @@ from datasets.files.meshes import read_mesh
 from datasets.files.own_photographs import ReadSettings, read_capture
 from datasets.mesh import Mesh
 from datasets.scene import sample_surface
-from tests.made_dtu import CENTRE, ball, on_ball, write_dtu
+from tests.made_dtu import CENTRE, ball, on_ball, solid, write_dtu
 from tests.made_photographs import CENTRE as PHOTOGRAPHED
 from tests.made_photographs import RADIUS, idr
 
@@ -118,13 +118,6 @@ def test_the_best_possible_distance_is_that_of_two_independent_samplings_of_the_
     first, second = (sample_surface(truth, 4000, seed) for seed in (7, 8))
     assert distance == pytest.approx(surface_metrics(first, second, threshold=1.0)["chamfer_l1"], rel=0.05)
     assert distance == pytest.approx(0.5 * (4 * np.pi * 2.0**2 / 4000) ** 0.5, rel=0.15)
-
-
-def solid() -> Mesh:
-    """An ellipsoid with a knob, without any symmetry."""
-    ellipsoid, knob = ball(1.0, (0, 0, 0)), ball(0.25, (0.6, 0.35, 0.2))
-    vertices = np.concatenate([ellipsoid.vertices * (1.0, 0.6, 0.35), knob.vertices])
-    return Mesh(vertices, np.concatenate([ellipsoid.faces, knob.faces + len(ellipsoid.vertices)]))
 
 
 def test_a_mesh_in_another_frame_than_its_truth_has_a_warning_with_the_change(files, capsys):

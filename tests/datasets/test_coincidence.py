@@ -24,17 +24,10 @@ from datasets.mesh import Mesh
 from datasets.scene import sample_surface
 from renderers.checks import BadInput
 from tests.looped import each
-from tests.made_dtu import ball
+from tests.made_dtu import ball, solid
 from tests.made_photographs import CENTRE, RADIUS, READ, nerf
 
 FACTORS = {1.0: "", 10.0: "millimetres", 2.54: "inches", 1000.0: "millimetres", 0.01: "metres", 0.5: ""}
-
-
-def solid() -> Mesh:
-    """An ellipsoid with a knob, without any symmetry."""
-    ellipsoid, knob = ball(1.0, (0, 0, 0)), ball(0.25, (0.6, 0.35, 0.2))
-    vertices = np.concatenate([ellipsoid.vertices * (1.0, 0.6, 0.35), knob.vertices])
-    return Mesh(vertices, np.concatenate([ellipsoid.faces, knob.faces + len(ellipsoid.vertices)]))
 
 
 POINTS = samples_of(solid())
