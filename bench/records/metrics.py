@@ -53,7 +53,7 @@ RENDERING_METRICS = {
 LISTED_METRICS = TABLE_METRICS | RENDERING_METRICS
 OTHER_DIRECTIONS = {  # which direction is better, for metrics that tables do not show
     **dict.fromkeys(("chamfer_l1", "chamfer_gt_to_pred"), LOWER),
-    **dict.fromkeys(("seen_roughness", "unseen_roughness", "own_early_weight"), LOWER),
+    **dict.fromkeys(("seen_roughness", "unseen_roughness", "own_early_weight", "floaters"), LOWER),
     **dict.fromkeys(("dtu_accuracy", "dtu_completeness"), LOWER),
     **dict.fromkeys(("mask_iou_least", "tnt_precision", "tnt_recall"), HIGHER),
 }

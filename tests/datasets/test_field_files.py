@@ -22,6 +22,7 @@ from renderers.fields.grid import Grid
 from renderers.fields.mlp import Decoder
 from renderers.fields.networks.coloured import (
     ColouredDistance,
+    ColouredEncoded,
     ColouredGrid,
     ColouredOccupancy,
     ScaledOccupancyOf,
@@ -67,6 +68,12 @@ FIELDS = {
     ),
     "lipschitz": lambda: LipschitzNetwork.new(2, 6, seed=1),
     "textured": lambda: TexturedDecoder(layers=2, width=8, code_length=4, skip=1, narrow=False).at(numbers(4)),
+    "coloured_hash": lambda: ColouredEncoded(
+        HashGrid(numbers(2, 16, 2), (2, 4), 1.05), layers=1, width=8, radius=0.5, directional=True
+    ),
+    "coloured_fourier": lambda: ColouredEncoded(
+        FourierFeatures(numbers(4, 3)), layers=2, width=8, radius=0.5, directional=False
+    ),
     "coloured_grid": lambda: ColouredGrid(samples=6, radius=0.5, reach=1.05),
     "occupancy": lambda: ColouredOccupancy(width=8, radius=0.5).field,
     "occupancy_at_code": lambda: ScaledOccupancyOf(OccupancyNetwork(width=8, code_length=3).at(numbers(3))),

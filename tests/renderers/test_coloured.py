@@ -10,10 +10,12 @@ from renderers.fields.networks.coloured import (
     COLOUR_LOGIT_SCALE,
     LOGIT_WIDTH,
     ColouredDistance,
+    ColouredEncoded,
     ColouredGrid,
     ColouredOccupancy,
     positional_encoding,
 )
+from renderers.fields.networks.encoded import FourierFeatures, HashGrid
 from tests.looped import each
 
 EXACT = {"rtol": 1e-10, "atol": 1e-12}
@@ -38,6 +40,25 @@ def test_it_begins_as_a_sphere(layers, width):
     assert on.mean().item() == pytest.approx(0.0, abs=0.01) and on.std() < 0.06
     assert inside.mean() < -0.15 and outside.mean().item() == pytest.approx(0.5, abs=0.1)
     assert autograd_gradients(network.field, 0.5 * points).norm(dim=-1).mean().item() == pytest.approx(1.0, abs=0.3)
+
+
+@each(
+    "encoding, layers",
+    [(HashGrid(1e-4 * torch.ones(2, 64, 2), (4, 16), 1.05), 1), (FourierFeatures(draw(8).float()), 3)],
+)
+def test_an_encoded_field_begins_as_a_sphere_and_learns_what_it_should(encoding, layers):
+    torch.manual_seed(0)
+    shape = ColouredEncoded(encoding, layers=layers, width=64, radius=0.5, directional=True).field
+    assert isinstance(shape, Coloured)
+    directions = torch.nn.functional.normalize(torch.randn(500, 3), dim=-1)
+    inside, on, outside = (shape(radius * directions).detach() for radius in (0.25, 0.5, 1.0))
+    assert on.mean().item() == pytest.approx(0.0, abs=0.02) and on.std() < 0.12
+    assert inside.mean() < -0.15 and outside.mean().item() == pytest.approx(0.5, abs=0.1)
+    colours = shape.colours(0.5 * directions, directions, directions)
+    (shape(0.5 * directions).sum() + colours.sum()).backward()
+    learnt = {name: bool(parameter.grad.any()) for name, parameter in shape.named_parameters()}
+    assert all(learnt.values()) and ("tables" in learnt) == isinstance(encoding, HashGrid)
+    assert not torch.equal(colours, shape.colours(0.5 * directions, directions, -directions))
 
 
 def test_the_encoding_has_sine_and_cosine_of_each_octave():

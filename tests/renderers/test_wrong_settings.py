@@ -15,7 +15,8 @@ from renderers.field import occupancy_logits
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.grid import Grid
 from renderers.fields.mlp import Decoder
-from renderers.fields.networks.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
+from renderers.fields.networks.coloured import ColouredDistance, ColouredEncoded, ColouredGrid, ColouredOccupancy
+from renderers.fields.networks.encoded import FourierFeatures
 from renderers.fields.networks.occupancy import OccupancyField, OccupancyNetwork
 from renderers.rendering import RayObservation
 from renderers.tracing.reference import trace
@@ -74,6 +75,8 @@ WRONG: list[tuple[str, Callable, dict]] = [  # words of the error, what is built
     (r"layers must be .*4 suit", partial(ColouredDistance, width=8, octaves=2, radius=0.5, directional=True),
      {"layers": 0}),
     (r"radius must be .*0\.5 lies", ColouredOccupancy, {"width": 8, "radius": 0.0}),
+    (r"layers must be .*1 suits", partial(ColouredEncoded, FourierFeatures(torch.zeros(4, 3)), width=8, radius=0.5,
+                                          directional=True), {"layers": 0}),
     (r"radius must be .*0\.5 lies", ColouredGrid, {"samples": 8, "reach": 1.0, "radius": 0.0}),
     (r"samples must be .*48 suit", ColouredGrid, {"samples": 1, "reach": 1.0, "radius": 0.5}),
     *(("values", partial(Grid, torch.zeros(shape)), {"reach": 1.0}) for shape in ((3, 3, 4), (3, 3), (1, 1, 1))),

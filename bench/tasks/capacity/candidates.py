@@ -132,24 +132,35 @@ def network(name: str, layers: int, width: int) -> Candidate:
     return Candidate(name, stored, bound(parameters).flops.value, starts, follows=True)
 
 
+def initial_fourier(count: int, draw: torch.Generator | None = None) -> FourierFeatures:
+    """Fourier features of `count` random frequencies; None draws from PyTorch's default generator."""
+    return FourierFeatures(FOURIER_STD * torch.randn(count, 3, generator=draw))
+
+
+def initial_hash_grid(levels: int, log2_entries: int, draw: torch.Generator | None = None) -> HashGrid:
+    """A hash grid of random features; the cells of its levels grow geometrically."""
+    ratio = (HASH_FINEST / HASH_COARSEST) ** (1 / (levels - 1))
+    cells = tuple(round(HASH_COARSEST * ratio**level) for level in range(levels))
+    drawn = torch.rand(levels, 2**log2_entries, HASH_FEATURES, generator=draw)
+    return HashGrid(HASH_INITIAL * (2 * drawn - 1), cells, REACH)
+
+
 def fourier(name: str, layers: int, width: int) -> Candidate:
     """A network of Fourier features, as many as a layer has neurons; the frequencies are drawn, and not fitted."""
 
     def encoding(draw: torch.Generator) -> tuple[list[Tensor], Callable[[list[Tensor]], Encoding]]:
-        frequencies = FOURIER_STD * torch.randn(width // 2, 3, generator=draw)
+        frequencies = initial_fourier(width // 2, draw).frequencies
         return [], lambda free: FourierFeatures(frequencies.to(free[0].device))
 
     return _encoded(name, encoding, [3 + 2 * (width // 2), *[width] * layers], fixed_count=3 * (width // 2))
 
 
 def hash_grid(name: str, levels: int, log2_entries: int) -> Candidate:
-    """A hash grid with a small network; the cells of its levels grow geometrically."""
-    ratio = (HASH_FINEST / HASH_COARSEST) ** (1 / (levels - 1))
-    cells = tuple(round(HASH_COARSEST * ratio**level) for level in range(levels))
+    """A hash grid with a small network."""
 
     def encoding(draw: torch.Generator) -> tuple[list[Tensor], Callable[[list[Tensor]], Encoding]]:
-        drawn = torch.rand(levels, 2**log2_entries, HASH_FEATURES, generator=draw)
-        return [HASH_INITIAL * (2 * drawn - 1)], lambda free: HashGrid(free[0], cells, REACH)
+        initial = initial_hash_grid(levels, log2_entries, draw)
+        return [initial.tables], lambda free: HashGrid(free[0], initial.cells, initial.reach)
 
     return _encoded(name, encoding, [3 + HASH_FEATURES * levels, *[HASH_WIDTH] * HASH_LAYERS])
 

@@ -15,6 +15,7 @@ from bench.records.format import plural
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext
 from bench.solve.optimise import History, OptimiserSettings, optimise
+from bench.tasks.capacity.candidates import initial_fourier, initial_hash_grid
 from bench.tasks.capacity.growth import Trials, climb
 from bench.tasks.capacity.held_out import HeldOutError
 from bench.tasks.capacity.model import Evidence, Size
@@ -25,9 +26,11 @@ from bench.tasks.reconstruction.problem import Learnt, ReconstructionProblem
 from bench.tasks.reconstruction.subject import Subject
 from datasets.shot import Shot
 from renderers.checks import BadInput, check_at_least, check_fraction, check_positive
-from renderers.fields.networks.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
+from renderers.fields.networks.coloured import ColouredDistance, ColouredEncoded, ColouredGrid, ColouredOccupancy
 
-FORMS = "task=reconstruction takes network_LAYERSxWIDTH, occupancy_WIDTH or grid_N"
+NETWORK_FORMS = "network_LAYERSxWIDTH, fourier_LAYERSxWIDTH, hash_LEVELSxLOG2ENTRIES"
+FORMS = f"task=reconstruction takes {NETWORK_FORMS}, occupancy_WIDTH or grid_N"
+HASH_WIDTH = 64  # neurons per layer of a hash grid's networks, as in Mueller et al. 2022
 VALIDATION_STEP = 8  # the trials do not learn from every 8th input photograph: it measures their error
 DEFINITIONS = {
     "field": "the field that field=auto ended on",
@@ -71,6 +74,13 @@ class Appearance:
             return ColouredDistance(**shape, radius=self.radius, directional=self.directional)
         if kind == "occupancy":
             return ColouredOccupancy(width=sizes[0], radius=self.radius)
+        if kind in ("hash", "fourier"):
+            hashed = kind == "hash"
+            encoding = initial_hash_grid(*sizes) if hashed else initial_fourier(sizes[1] // 2)
+            layers, width = (1, HASH_WIDTH) if hashed else sizes
+            return ColouredEncoded(
+                encoding, layers=layers, width=width, radius=self.radius, directional=self.directional
+            )
         if kind == "grid":
             return ColouredGrid(samples=sizes[0], radius=self.radius, reach=REACH)
         raise BadInput(f"field={name} has no colours: {FORMS}")

@@ -19,7 +19,8 @@ from renderers.field import Meter
 class DistanceFit(Reconstruction):
     """Fits the field of a reconstruction to signed distances of the true mesh; no renderer takes part in the fit.
 
-    The settings of `Reconstruction` keep their meaning. But `rays`, `losses`, `guide` and `pixel_block` have no effect.
+    The settings of `Reconstruction` keep their meaning. But `rays`, `losses`, `guide`, `pixel_block`
+    and `blur_points` have no effect.
 
     Args:
         distances: number of signed distances of the shape.

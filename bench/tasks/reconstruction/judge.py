@@ -24,7 +24,14 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunInputs
 from bench.tasks.reconstruction.subject import Subject
 from bench.tasks.reconstruction.surfaces import painter, with_colours
-from bench.tasks.reconstruction.symptoms import ROUGHNESS, WEIGHT, early_weight, roughness_scores
+from bench.tasks.reconstruction.symptoms import (
+    FLOATERS,
+    ROUGHNESS,
+    WEIGHT,
+    early_weight,
+    floater_scores,
+    roughness_scores,
+)
 from datasets.mesh import Mesh
 from datasets.scene import View, sample_surface
 from datasets.shot import Shot, mask_iou
@@ -53,6 +60,7 @@ COLOURED_DEFINITIONS = {
         for name in SURFACE_METRICS
     },
     **ROUGHNESS,
+    **FLOATERS,
     **{name: text + MESH_IMAGE_NOTE for name, text in IMAGE_SCORES.items()},
     **{
         OWN_PREFIX + name: f"{text} Of the image that the renderer under test renders."
@@ -109,7 +117,8 @@ def surface_scores(mesh: Mesh | None, subject: Subject, inputs: RunInputs) -> di
         seen_sample, sampled_and_seen = sampled.select(sampled_seen), (sampled, sampled_seen)
     seen_scores = surface_metrics(seen_sample, true.select(true_seen), threshold=threshold)
     roughness = roughness_scores(sampled_and_seen, (true, true_seen))
-    return scores | {SEEN_PREFIX + name: value for name, value in seen_scores.items()} | roughness
+    seen_names = {SEEN_PREFIX + name: value for name, value in seen_scores.items()}
+    return scores | seen_names | roughness | floater_scores(mesh, true)
 
 
 def field_scores(state: State, shots: Sequence[Shot]) -> dict[str, float]:

@@ -16,6 +16,7 @@ from bench.pictures.filmstrip import Shown
 from bench.solve.latent_code import Terms
 from bench.solve.pixel_draw import generator_of
 from bench.tasks.reconstruction.background import OneColour, OutsideSphere
+from bench.tasks.reconstruction.blur import PointBlur
 from bench.tasks.reconstruction.cameras import CameraMotions
 from bench.tasks.reconstruction.judge import field_scores, judge, surface_scores
 from bench.tasks.reconstruction.losses import Losses
@@ -26,12 +27,13 @@ from datasets.scene import View
 from renderers.boundary import render_checked
 from renderers.camera import Camera
 from renderers.field import Coloured, Counts, Meter
-from renderers.fields.networks.coloured import ColouredDistance, ColouredGrid, ColouredOccupancy
+from renderers.fields.networks.coloured import ColouredDistance, ColouredEncoded, ColouredGrid, ColouredOccupancy
 from renderers.rendering import Renderer, at_iteration
 
 OBJECTIVE_PIXELS = 4096  # compared before and after the optimisation
 Behind = OneColour | OutsideSphere
-Learnt = ColouredDistance | ColouredOccupancy | ColouredGrid  # modules whose `field` is a Coloured
+# Modules whose `field` is a Coloured.
+Learnt = ColouredDistance | ColouredEncoded | ColouredOccupancy | ColouredGrid
 
 
 @dataclass
@@ -48,6 +50,7 @@ class ReconstructionProblem:
     seed: int
     motions: CameraMotions
     background: Behind | None = None
+    blur: PointBlur = field(default_factory=PointBlur)
     counts: Counts = field(default_factory=Counts)
 
     @property
@@ -99,6 +102,7 @@ class ReconstructionProblem:
         patches = self.losses.colour_gradient > 0
         seed = generator_of(self.seed, iteration).initial_seed()
         pixels = self.motions.apply(self.stack.draw(self.rays_per_iteration, patches=patches, seed=seed))
+        pixels = self.blur.apply(pixels, iteration, self.iterations, self.seed)
         shape = self.model.field
         renderer = at_iteration(self.renderer, iteration)
         return self.losses(renderer, shape, Meter(shape, self.counts), pixels, self.background)

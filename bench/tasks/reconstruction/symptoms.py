@@ -1,4 +1,4 @@
-"""Failures that users of volume renderers report: weight in front of the surface, and bumps in unseen regions."""
+"""Failures that users of volume renderers report: floaters, weight in front of the surface, bumps where unseen."""
 
 from collections.abc import Sequence
 
@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from bench.evaluate.evaluate import OWN_PREFIX
 from bench.setup.inputs import RunInputs
+from datasets.mesh import Mesh
 from datasets.scene import Surface, View
 from renderers.boundary import render_checked
 from renderers.field import Field
@@ -16,6 +17,11 @@ from renderers.field import Field
 MAX_NEIGHBOUR_DISTANCE = 0.05  # scene units: normals of surface points up to this distance are compared
 EARLY_WEIGHT_GAP = 0.05  # scene units: weight farther in front of the surface than this is early
 MIN_RAY_WEIGHT = 1e-3  # a ray with a smaller sum of weights sees no surface
+FLOATER_DISTANCE = 0.05  # scene units: a connected part without a vertex nearer to the true surface is a floater
+FLOATERS = {
+    "floaters": "Share of the mesh's area in connected parts of which no vertex lies within 0.05 scene units of the "
+    "true surface, from 0 to 1. Infinite without a surface."
+}
 ROUGHNESS = {
     f"{name}_roughness": "Mean angle between the normals of two points sampled on the surface at most 0.05 scene units "
     f"apart, that {others} given photograph sees, less the same of the true surface, in degrees; normals count without "
@@ -28,6 +34,16 @@ WEIGHT = {
     "of the mesh, mean over the rays of held-out photographs that hit it and have weight; of renderers that sum along "
     "rays (NeuS, Sec. 3.1: an unbiased rendering has its greatest weight at the surface)."
 }
+
+
+def floater_scores(mesh: Mesh | None, truth: Surface) -> dict[str, float]:
+    """The metric of `FLOATERS`, against points on the true surface."""
+    if mesh is None:
+        return dict.fromkeys(FLOATERS, np.inf)
+    near = cKDTree(truth.points).query(mesh.vertices, distance_upper_bound=FLOATER_DISTANCE)[0] < np.inf
+    is_attached = np.bincount(mesh.parts, weights=near[mesh.faces].any(axis=1)) > 0
+    areas = np.bincount(mesh.parts, weights=np.linalg.norm(mesh.area_normals, axis=1))
+    return dict.fromkeys(FLOATERS, float(areas[~is_attached].sum() / areas.sum()))
 
 
 def roughness_scores(

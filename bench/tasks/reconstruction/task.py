@@ -13,6 +13,7 @@ from bench.solve.optimise import OptimiserSettings, with_affordable_rays
 from bench.solve.solve import check_field_gradient, solve_and_draw
 from bench.tasks.reconstruction import background as behind
 from bench.tasks.reconstruction import cameras
+from bench.tasks.reconstruction.blur import BLUR_SHARE, PointBlur
 from bench.tasks.reconstruction.choice import DEFINITIONS, Appearance, AutoField
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, judge
 from bench.tasks.reconstruction.losses import Losses
@@ -59,6 +60,7 @@ class Reconstruction(PhotographTask):
             None: 0, and the errors of cameras are not measured.
         background: what rays see that pass the object, for photographs without masks: "none", "black", "grey", "white",
             or "sphere", which learns it; see `bench.tasks.reconstruction.background.OutsideSphere`.
+        blur_points, blur_share: `start` and `share` of `bench.tasks.reconstruction.blur.PointBlur`; 0 is no blur.
     """
 
     guide: str
@@ -71,6 +73,8 @@ class Reconstruction(PhotographTask):
     cameras: str = cameras.GIVEN
     camera_noise: float | None = None
     background: str = behind.NONE
+    blur_points: float = 0.0
+    blur_share: float = BLUR_SHARE
 
     takes_field: ClassVar[bool] = True
 
@@ -81,6 +85,7 @@ class Reconstruction(PhotographTask):
         check_at_least("task.rays", self.rays, 4, "1024 work")
         check_choice("task.cameras", self.cameras, cameras.CHOICES)
         check_choice("task.background", self.background, behind.CHOICES)
+        PointBlur(self.blur_points, self.blur_share)  # checks both
         if self.losses.normals and (self.camera_noise or self.cameras == cameras.REFINE):
             raise ValueError(
                 "given normals are in world axes, which wrong cameras do not know: set task.losses.normals=0"
@@ -148,14 +153,14 @@ class Reconstruction(PhotographTask):
         shots = cameras.disturbed(subject.input_shots, self.camera_noise or 0, crc32(inputs.scene_name.encode()))
         guide = {GIVEN: given_distances, HULL: hull_distances}.get(self.guide)
         stack = Stack.build(shots, guide and guide(shots), inputs.device)
-        iterations = self.optimiser.iterations
+        iterations, blur = self.optimiser.iterations, PointBlur(self.blur_points, self.blur_share)
 
         def problem(task: Reconstruction) -> ReconstructionProblem:
             rays = max(self.rays // task.pixel_block**2, 4)
             motions = cameras.CameraMotions(shots, true, self.cameras == cameras.REFINE, inputs.device)
             background = behind.make(self.background)
             learnt_background = None if background is None else background.to(inputs.device)
-            args = self.losses, inputs.renderer, rays, iterations, inputs.seed, motions, learnt_background
+            args = self.losses, inputs.renderer, rays, iterations, inputs.seed, motions, learnt_background, blur
             return ReconstructionProblem(subject, stack, model, *args)
 
         return with_affordable_rays(self, problem)

@@ -14,6 +14,7 @@ from renderers.checks import check_at_least, check_positive
 from renderers.field import Flops, Kind, Vectors
 from renderers.fields.grid import FLOPS, Grid
 from renderers.fields.mlp import split_into_passes
+from renderers.fields.networks.encoded import EncodedNetwork, Encoding, FourierFeatures, HashGrid
 from renderers.fields.networks.network import flops_of
 from renderers.fields.networks.occupancy import BoundOccupancy, OccupancyField, OccupancyNetwork
 
@@ -104,6 +105,98 @@ class ColouredDistance(nn.Module):
         for layer in self.hidden:
             features = softplus(layer(features), beta=SOFTPLUS_BETA)
         return features
+
+
+class ColouredEncoded(nn.Module):
+    """A hash grid or Fourier features with a ReLU network of distances, and a colour network that takes them too.
+
+    It is initialised to a sphere about the origin, see `ColouredDistance`; the encoding has zero weights.
+
+    Source: `encoded.EncodedNetwork` for distances; colours of point, normal, direction and features as in IDR.
+    Deviates: distances and colours share one encoding; the colours' features are those of the encoding.
+
+    Args:
+        encoding: its initial numbers. The tables of a hash grid are learnt, the frequencies of Fourier features not.
+        layers: hidden layers of the distance network, at least 1.
+        width: neurons per hidden layer; the colour network has two hidden layers.
+        radius: of the initial sphere, in scene units.
+        directional: whether colours depend on the view direction.
+    """
+
+    kind: ClassVar[Kind] = Kind.DISTANCE
+    lipschitz: ClassVar[None] = None
+
+    def __init__(
+        self, encoding: HashGrid | FourierFeatures, *, layers: int, width: int, radius: float, directional: bool
+    ) -> None:
+        super().__init__()
+        check_at_least("layers", layers, 1, "1 suits a hash grid, 4 suit Fourier features")
+        check_positive("radius", radius, "0.5 lies within most objects")
+        self.directional = directional
+        if isinstance(encoding, HashGrid):
+            self.cells, self.reach = encoding.cells, encoding.reach
+            self.tables = nn.Parameter(encoding.tables)
+        else:
+            self.register_buffer("frequencies", encoding.frequencies)
+        features = self.encoding(torch.zeros(1, 3)).shape[1]
+        self.distance = nn.ModuleList(nn.Linear(*pair) for pair in pairwise([3 + features, *[width] * layers, 1]))
+        direction_inputs = 3 + 6 * DIRECTION_OCTAVES if directional else 0
+        self.colour = nn.ModuleList(
+            nn.Linear(*pair) for pair in pairwise([features + 6 + direction_inputs, width, width, 3])
+        )
+        self._initialise_to_sphere(radius)
+
+    @torch.no_grad()
+    def _initialise_to_sphere(self, radius: float) -> None:
+        layers = self._distance_layers
+        for weight, bias in layers:
+            weight.normal_(0.0, sqrt(2 / len(weight)))
+            bias.zero_()
+        layers[0][0][:, 3:] = 0.0
+        last_weight, last_bias = layers[-1]
+        last_weight.fill_(sqrt(pi / last_weight.shape[1]))
+        sphere_points = radius * torch.nn.functional.normalize(torch.randn(INIT_SPHERE_POINTS, 3), dim=-1)
+        last_bias.fill_(-self(sphere_points).mean())
+
+    @property
+    def _distance_layers(self) -> tuple[tuple[Tensor, Tensor], ...]:
+        """The weight and the bias of each layer of the distance network."""
+        return tuple((layer.weight, layer.bias) for layer in self.distance if isinstance(layer, nn.Linear))
+
+    @property
+    def encoding(self) -> Encoding:
+        """The encoding with its current numbers."""
+        if hasattr(self, "tables"):
+            return HashGrid(self.tables, self.cells, self.reach)
+        return FourierFeatures(self.get_buffer("frequencies"))
+
+    @property
+    def network(self) -> EncodedNetwork:
+        """The field without colours."""
+        return EncodedNetwork(self.encoding, self._distance_layers)
+
+    @property
+    def field(self) -> "ColouredEncoded":
+        """Itself; close to a distance if the loss has an eikonal term."""
+        return self
+
+    @property
+    def flops(self) -> Flops:
+        """Of one distance."""
+        return self.network.flops
+
+    def forward(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        """The distances."""
+        return self.network(points)
+
+    def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
+        """See `Coloured`; directions are unused unless `directional`."""
+        direction_encoding = [positional_encoding(directions, DIRECTION_OCTAVES)] if self.directional else []
+        features = torch.cat([self.encoding(points), points, normals, *direction_encoding], dim=-1)
+        *layers, last = self.colour
+        for layer in layers:
+            features = layer(features).relu()
+        return torch.sigmoid(last(features))
 
 
 class ColouredOccupancy(nn.Module):

@@ -13,9 +13,17 @@ from bench.evaluate.state import State, empty_view
 from bench.records.record import RunStatus
 from bench.tasks.reconstruction.judge import COLOURED_DEFINITIONS, OWN_PREFIX, image_scores, judge, surface_scores
 from bench.tasks.reconstruction.subject import Subject
-from bench.tasks.reconstruction.symptoms import ROUGHNESS, WEIGHT, early_weight, roughness, roughness_scores
+from bench.tasks.reconstruction.symptoms import (
+    ROUGHNESS,
+    WEIGHT,
+    early_weight,
+    floater_scores,
+    roughness,
+    roughness_scores,
+)
+from datasets.mesh import Mesh
 from datasets.photographs import around
-from datasets.scene import Surface, Truth, View, see
+from datasets.scene import Surface, Truth, View, sample_surface, see
 from datasets.shot import Shot
 from renderers.boundary import render_checked
 from renderers.camera import sphere_span
@@ -187,3 +195,20 @@ def test_a_wide_blur_has_weight_before_the_surface(subject: Subject, inputs, sha
 def test_a_renderer_of_hits_has_no_weight_before_the_surface(subject: Subject, inputs):
     assert early_weight(painted(), [see(Truth(subject.truth), subject.held_out[0].camera)], inputs) == {}
     assert early_weight(painted(), [empty_view(shot.camera) for shot in subject.held_out], inputs) == {}
+
+
+def test_floaters_are_the_area_of_parts_away_from_the_true_surface():
+    ball = icosphere(0.5)
+    truth = sample_surface(ball, 5000, 0)
+
+    def beside(radius: float, x: float) -> Mesh:
+        """The ball, with another of a radius at x."""
+        other = icosphere(radius).moved(np.array([[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]))
+        vertices = np.concatenate([ball.vertices, other.vertices])
+        return Mesh(vertices, np.concatenate([ball.faces, other.faces + len(ball.vertices)]))
+
+    assert floater_scores(ball, truth) == {"floaters": 0.0}
+    assert floater_scores(beside(0.1, 0.8), truth)["floaters"] == pytest.approx(0.04 / 1.04, rel=1e-6)
+    assert floater_scores(beside(0.1, 0.64), truth)["floaters"] == 0  # it comes within 0.04 of the surface
+    assert floater_scores(beside(0.1, 0.0), truth)["floaters"] == pytest.approx(0.04 / 1.04, rel=1e-6)  # a part within
+    assert floater_scores(None, truth)["floaters"] == np.inf
