@@ -1,6 +1,7 @@
 """Sphere tracing with a band about the silhouette that carries its gradient (Wang et al., SIGGRAPH Asia 2024)."""
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -66,7 +67,7 @@ class RelaxedBoundary(SurfaceRenderer):
         check_kind(self, field)
         flat = rays.flat()
         with torch.no_grad():
-            front, near_distance, near_value = self._march(field, flat)
+            front, near_distance, near_value = march_past_near_misses(self, field, flat, self.band)
         rendering = implicit_rendering(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)
         distance, hit = rendering.distance.view(-1), (front.status == Status.HIT).nonzero().squeeze(-1)
         near = near_value.isfinite().nonzero().squeeze(-1)
@@ -76,13 +77,31 @@ class RelaxedBoundary(SurfaceRenderer):
         distances, weights = torch.cat([near_distance[near], distance[hit]]), torch.cat([near_weight, hit_weight])
         return replace(rendering, volume=Volume(torch.cat([near, hit]), distances, weights))
 
-    def _march(self, field: Field, rays: Rays) -> tuple[RayFront, Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """The front, and the distance and value of each ray's first near miss; the value is infinite without one."""
-        front = RayFront.on_sphere(rays, radius=self.sphere_radius, samples=1)
-        tracker = NearMissTracker(self, field, rays, front.distance)
-        march_front(field, rays, front, Stepping(self.epsilon), self.steps, on_step=tracker.add_sample)
-        tracker.find_near_misses()
-        return front, tracker.distance, tracker.value
+
+class Marching(Protocol):
+    """The settings of a march; see `RelaxedBoundary`."""
+
+    @property
+    def steps(self) -> int: ...
+    @property
+    def epsilon(self) -> float: ...
+    @property
+    def sphere_radius(self) -> float: ...
+
+
+def march_past_near_misses(
+    settings: Marching, field: Field, rays: Rays, band: float | Float[Tensor, ""]
+) -> tuple[RayFront, Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """The front of n rays, and the distance and value of each one's first near miss; the value is infinite without one.
+
+    Args:
+        band: a near miss has a value below `epsilon` plus this, in field units.
+    """
+    front = RayFront.on_sphere(rays, radius=settings.sphere_radius, samples=1)
+    tracker = NearMissTracker(band, settings.epsilon, field, rays, front.distance)
+    march_front(field, rays, front, Stepping(settings.epsilon), settings.steps, on_step=tracker.add_sample)
+    tracker.find_near_misses()
+    return front, tracker.distance, tracker.value
 
 
 class NearMissTracker:
@@ -91,8 +110,10 @@ class NearMissTracker:
     Samples are stored during the march, and searched every `STEPS_PER_BATCH` steps.
     """
 
-    def __init__(self, renderer: RelaxedBoundary, field: Field, rays: Rays, start: Float[Tensor, " n"]) -> None:
-        self.renderer, self.field, self.rays, self.sample_count = renderer, field, rays, 2
+    def __init__(
+        self, band: float | Float[Tensor, ""], epsilon: float, field: Field, rays: Rays, start: Float[Tensor, " n"]
+    ) -> None:
+        self.band, self.epsilon, self.field, self.rays, self.sample_count = band, epsilon, field, rays, 2
         self.distance, self.value = start.clone(), torch.full_like(start, torch.inf)
         # By step, distance or value, and ray; the first two steps are the last two of the batch before.
         self.samples = start.new_full((2 + STEPS_PER_BATCH, 2, len(start)), torch.nan)
@@ -106,7 +127,7 @@ class NearMissTracker:
 
     def find_near_misses(self) -> None:
         """Evaluates the field at local minima of the stored samples; the first one within the band is a near miss."""
-        band, epsilon, values = self.renderer.band, self.renderer.epsilon, self.samples[:, 1]
+        band, epsilon, values = self.band, self.epsilon, self.samples[:, 1]
         before, middle, after = values[:-2], values[1:-1], values[2:]
         minima = (middle < before) & (middle < after) & (middle > 0) & (middle < CANDIDATE_FACTOR * band)
         step, ray = (minima & self.value.isinf()).nonzero(as_tuple=True)

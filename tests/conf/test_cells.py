@@ -34,7 +34,7 @@ COMPARING = {
     "fig4": 7,
     "fig5": 9,
     "stability": 22,
-    "gradients": 16,
+    "gradients": 17,
     "speed_accuracy": 32,
     "fit_for": 19,
 }  # renderers

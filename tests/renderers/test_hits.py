@@ -61,7 +61,10 @@ def test_hits_within_the_largest_shipped_epsilon_are_not_flagged():
     assert float(PLATE(RAYS.at(hits.distance)[hits.hit]).max()) > 0.02 and hits.off_surface() == ""
 
 
-@each("name", ["dist", "dvr", "newton", "mesh_proxy", "relaxed_boundary", "neus", "opaque", "unisurf", "volsdf"])
+@each(
+    "name",
+    ["dist", "dvr", "newton", "mesh_proxy", "relaxed_boundary", "edge_sampling", "neus", "opaque", "unisurf", "volsdf"],
+)
 def test_distances_that_are_5_percent_short_are_noted_in_each_kind_of_field(name):
     for kind in load("renderer", name).capabilities.needs:
         note = hits_of(WrongHits("short", name), stated(PLATE, kind)).off_surface()

@@ -36,6 +36,7 @@ VOLUMES = {
     "volsdf": "error",
     "unisurf": "interval",
     "relaxed_boundary": "band",
+    "edge_sampling": "width",
 }
 
 

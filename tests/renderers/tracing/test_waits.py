@@ -15,7 +15,7 @@ from tests.looped import each
 from tests.tiny import camera_of
 
 COARSE_ERROR = 0.002
-MARCHED = ("dist", "dist_keinert", "dist_auto_relaxed", "idr", "relaxed_boundary", "newton")
+MARCHED = ("dist", "dist_keinert", "dist_auto_relaxed", "idr", "relaxed_boundary", "edge_sampling", "newton")
 SETTINGS = {
     "dist_keinert": {"n_gradient_samples": 3},
     "idr": {"steps": 13},
