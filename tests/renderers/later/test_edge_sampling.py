@@ -124,6 +124,9 @@ def test_rays_that_are_no_image_have_the_derivative_of_a_near_miss_over_the_widt
     assert rendering.opacity.tolist() == [0, 0]
     (rate,) = torch.autograd.grad(rendering.opacity.sum(), leaf)
     assert rate.item() == pytest.approx(1 / EDGES.width, rel=1e-6)
+    flat = Shape(lambda p: 0.7 * sphere(leaf)(p), Kind.BOUND, 0.7)  # its band is 1 / 0.7 times as wide
+    (scaled,) = torch.autograd.grad(EDGES.render(flat, rays).opacity.sum(), leaf)
+    assert scaled.item() == pytest.approx(0.7 / EDGES.width, rel=1e-3)
     (wider,) = torch.autograd.grad(EDGES.with_blur(0.02).render(sphere(leaf), rays).opacity.sum(), leaf)
     assert wider.item() == pytest.approx(1 / 0.02, rel=1e-6)
 

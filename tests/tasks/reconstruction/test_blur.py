@@ -9,7 +9,8 @@ from bench.config import load
 from bench.tasks.reconstruction.blur import PointBlur
 from bench.tasks.reconstruction.pixels import Pixels
 from renderers.camera import Rays
-from renderers.fields.analytic import sphere
+from renderers.field import Kind
+from renderers.fields.analytic import Shape, sphere
 from renderers.schedule import Iteration
 from tests.looped import each
 
@@ -63,6 +64,13 @@ def test_each_ray_hits_the_surface_that_its_points_see(name):
     assert clear.sum() > 80 and rendering.hit[clear].all()
     expected = -moved.origins[:, 2] - depth
     torch.testing.assert_close(rendering.distance[clear], expected[clear], atol=5e-3, rtol=0)
+
+
+@each("name, hits", [("idr", 0.2), ("newton", 0.8)])
+def test_with_a_draw_per_point_a_march_would_lose_hits(name, hits):
+    torch.manual_seed(0)
+    field = Shape(lambda points: sphere(0.6)(points + 0.02 * torch.randn_like(points)), Kind.DISTANCE, 1.0)
+    assert load("renderer", name).render(field, pixels_of(200).rays).hit.float().mean() < hits
 
 
 def test_wrong_settings_are_named():
