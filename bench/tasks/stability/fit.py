@@ -35,6 +35,7 @@ SLOPE_POINTS = 4096
 HOLE_RADIUS = 0.3  # scene units
 OCCLUDER_RADIUS, OCCLUDER_OFFSET = 0.2, 0.1  # scene units; the offset is that of the initial position
 OCCLUDER_REACH = 0.6  # scene units: the maximum distance of its middle from the origin keeps it inside the sphere
+OCCLUDER_ZOOM = 2.5  # of the view of an occluder: a pixel is then a third of its initial offset
 AZIMUTHS, ELEVATIONS = (0.0, 360.0), (15.0, 35.0)  # degrees
 SPREAD_VIEWS, ALL_SIDES_DEGREES = 3, 240.0
 DEFINITIONS = {
@@ -152,7 +153,7 @@ class Hole:
 
 @dataclass(frozen=True)
 class Occluder:
-    """A round part before a surface, at an unknown position across the view.
+    """A round part before a surface, at an unknown position across the view; near the sphere, it lies partly inside.
 
     It is a ball if its edge is rounded by its radius. With a sharp edge it is a short cylinder that faces the camera.
     Then its visible surface does not change when it moves across the view. Only its outline before the shape does.
@@ -236,6 +237,7 @@ def judge_fit(
     direction = draw.uniform(*AZIMUTHS), draw.uniform(*ELEVATIONS)
     is_spread = name == "one_sided_views"
     cameras = _cameras(direction, fit.resolution, severity if is_spread else None)
+    cameras = [camera.zoomed(OCCLUDER_ZOOM) for camera in cameras] if is_occluded else cameras
     observations = [_observe(true, camera) for camera in cameras]
     modification, unknown, initial_unknown = _modification(name, severity, observations[0], draw)
     if modification is not None:
@@ -305,22 +307,26 @@ def _modification(
     """The modification of the true shape, the true value of its unknown, and the initial value."""
     camera, hit = observation.camera, observation.mask.flatten()
     rays = camera.rays().flat()
-    middle = rays.directions[hit].mean(dim=0) if hit.any() else rays.directions.mean(dim=0)
-    direction = torch.nn.functional.normalize(middle, dim=0)
     if name == "new_hole":
+        middle = rays.directions[hit].mean(dim=0) if hit.any() else rays.directions.mean(dim=0)
+        direction = torch.nn.functional.normalize(middle, dim=0)
         # The initial radius is that far below half of the true one (Mehta et al. 2022, on the topology of level sets).
         start = HOLE_RADIUS / 2 - severity
         return Hole(camera.center.float(), direction), torch.tensor(HOLE_RADIUS), torch.tensor(start)
     if name == "occlusion":
         # A ray that hits a surface has no gradient of such an outline (Li et al. 2018; Vicini et al. 2022).
-        nearest = ((rays.directions - direction).norm(dim=-1) + ~hit * 10.0).argmin()
-        right = torch.nn.functional.normalize(torch.linalg.cross(direction, torch.tensor([0.0, 1.0, 0.0])), dim=0)
-        axes = torch.stack([right, -direction, torch.linalg.cross(direction, right)])
+        centre = rays.directions.mean(dim=0)
+        nearest = ((rays.directions - centre).norm(dim=-1) + ~hit * 10.0).argmin()
+        towards = -rays.directions[nearest]
+        right = torch.nn.functional.normalize(torch.linalg.cross(towards, torch.tensor([0.0, -1.0, 0.0])), dim=0)
+        axes = torch.stack([right, towards, torch.linalg.cross(right, towards)])
         shown = rays.at(camera.distance(observation.depth).flatten())[nearest]
+        along = shown @ towards
+        room = (along**2 - shown @ shown + OCCLUDER_REACH**2).clamp_min(0).sqrt() - along
+        middle = shown + room.clamp(max=OCCLUDER_RADIUS) * towards
         angle = draw.uniform(0.0, 2 * np.pi)
         start = OCCLUDER_OFFSET * torch.tensor([np.cos(angle), np.sin(angle)]).float()
-        shown *= (OCCLUDER_REACH / shown.norm()).clamp(max=1.0)
-        return Occluder(shown, axes, severity * OCCLUDER_RADIUS), torch.zeros(2), start
+        return Occluder(middle, axes, severity * OCCLUDER_RADIUS), torch.zeros(2), start
     return None, torch.zeros(0), torch.zeros(0)
 
 

@@ -259,7 +259,7 @@ def test_a_disturbed_fit_ends_further_off(scene):
 @each(
     "name, renderer",
     [("growing_slope", "dist"), ("new_hole", "dist"), ("outside_family", "dist"), ("thin_parts", "dist"),
-     ("one_sided_views", "dist"), ("occlusion", "dvr")],
+     ("one_sided_views", "dist"), ("occlusion", "newton")],
 )  # fmt: skip
 def test_a_fit_of_a_code_succeeds_at_the_mild_end_and_fails_at_the_severe_one(name, renderer):
     stress = stress_named(name)
