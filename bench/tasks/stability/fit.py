@@ -35,7 +35,7 @@ SLOPE_POINTS = 4096
 HOLE_RADIUS = 0.3  # scene units
 OCCLUDER_RADIUS, OCCLUDER_OFFSET = 0.2, 0.1  # scene units; the offset is that of the initial position
 OCCLUDER_REACH = 0.6  # scene units: the maximum distance of its middle from the origin keeps it inside the sphere
-OCCLUDER_ZOOM = 2.5  # of the view of an occluder: a pixel is then a third of its initial offset
+OCCLUDER_ZOOM_FACTOR = 2.5
 AZIMUTHS, ELEVATIONS = (0.0, 360.0), (15.0, 35.0)  # degrees
 SPREAD_VIEWS, ALL_SIDES_DEGREES = 3, 240.0
 DEFINITIONS = {
@@ -237,7 +237,7 @@ def judge_fit(
     direction = draw.uniform(*AZIMUTHS), draw.uniform(*ELEVATIONS)
     is_spread = name == "one_sided_views"
     cameras = _cameras(direction, fit.resolution, severity if is_spread else None)
-    cameras = [camera.zoomed(OCCLUDER_ZOOM) for camera in cameras] if is_occluded else cameras
+    cameras = [camera.zoomed(OCCLUDER_ZOOM_FACTOR) for camera in cameras] if is_occluded else cameras
     observations = [_observe(true, camera) for camera in cameras]
     modification, unknown, initial_unknown = _modification(name, severity, observations[0], draw)
     if modification is not None:

@@ -257,16 +257,16 @@ def test_a_disturbed_fit_ends_further_off(scene):
 
 @pytest.mark.slow
 @each(
-    "name, renderer",
-    [("growing_slope", "dist"), ("new_hole", "dist"), ("outside_family", "dist"), ("thin_parts", "dist"),
-     ("one_sided_views", "dist"), ("occlusion", "newton")],
+    "name, repeat",
+    [("growing_slope", 0), ("new_hole", 0), ("outside_family", 0), ("thin_parts", 0), ("one_sided_views", 0),
+     ("occlusion", 2)],
 )  # fmt: skip
-def test_a_fit_of_a_code_succeeds_at_the_mild_end_and_fails_at_the_severe_one(name, renderer):
+def test_a_fit_of_a_code_succeeds_at_the_mild_end_and_fails_at_the_severe_one(name, repeat):
     stress = stress_named(name)
     held = replace(
         conditions(), prior=sofa_prior(), fit=replace(FIT, resolution=20, silhouette=load("silhouette", "hinge"))
     )
-    mild, severe = (stress.trial(load("renderer", renderer), level, 0, held) for level in (0.0, 1.0))
+    mild, severe = (stress.trial(load("renderer", "dist"), level, repeat, held) for level in (0.0, 1.0))
     assert mild.success and severe.numbers["surface_error"] > 2 * mild.numbers["surface_error"]
     assert not severe.success
 
