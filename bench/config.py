@@ -371,8 +371,9 @@ def _build_dataclass(cls: type, arguments: dict[str, Any], name: str, packages: 
     for key, child in nested.items():
         target = _class_path(child) if child else ""
         values[key] = build(arguments[key], f"{name}.{key}", packages, target, role=child or _protocol(types[key]))
-    defaults = {item.name: {item.default, item.default_factory} != {dataclasses.MISSING} for item in fields(cls)}
-    if missing := [key for key, has_default in defaults.items() if key not in values and not has_default]:
+    no_default = dataclasses.MISSING
+    required = [item.name for item in fields(cls) if item.default is item.default_factory is no_default]
+    if missing := [key for key in required if key not in values]:
         is_foreign = name == "renderer" and cls.__module__.partition(".")[0] not in OUR_PACKAGES
         raise ValueError(_missing_values_message(cls, name, missing, plus="+" if is_foreign else ""))
     try:

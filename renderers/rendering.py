@@ -143,7 +143,7 @@ class RayObservation:
 class Renderer(Protocol):
     """Finds surfaces along rays. It never times, logs or draws, and knows no task.
 
-    It waits for a GPU only to remove finished rays.
+    It waits for a GPU only where it needs a number of rays.
     """
 
     capabilities: ClassVar[Capabilities]

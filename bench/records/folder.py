@@ -223,7 +223,9 @@ def _reserve_bytes(folder: Path) -> None:
 @lru_cache
 def _our_code_hash(targets: frozenset[str], has_user_code: bool) -> str:
     """Hash of the code that a run imports, of shipped priors and library versions; user code may import any of ours."""
-    every_file = sorted(path for package in OUR_PACKAGES for path in (ROOT / package).rglob("*.py"))
+    every_file = sorted(
+        path for package in OUR_PACKAGES for path in (ROOT / package).rglob("*") if path.suffix in (".py", ".cpp")
+    )
     files = every_file if has_user_code else imported_files(targets)
     shipped = sorted((ROOT / "datasets" / "priors").glob("*.safetensors"))
     return digest([*map(_file_hash, [*files, *shipped]), *(version(library) for library in HASHED_LIBRARIES)])

@@ -10,6 +10,8 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bench.records import format
 from bench.records.metrics import HIGHER, LISTED_METRICS, LOWER, Metric, better_direction
 from bench.records.names import differences
@@ -49,7 +51,10 @@ SMALL_POINTS = (
     "Costs are medians over runs that ended ok."
 )
 FRONT = "Grey steps: the front, of the rows for which no other is both cheaper and better."
-RATIO = "A ratio is the median of the ratios on the same shapes. Its interval is of the sign test."
+RATIO = (
+    "A ratio is the median over shapes of the ratios of errors, which are medians over seeds. Its interval is of the "
+    "sign test."
+)
 UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
 
 
@@ -218,7 +223,8 @@ def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | N
     mine, theirs = ({run_key(run): error(run, metric) for run in row} for row in (runs, first))
     if not metric or runs is first or set(mine) != set(theirs):
         return None
-    return ratio(by_shape(mine), by_shape({key: theirs[key] for key in mine}))
+    groups = (by_shape(mine), by_shape({key: theirs[key] for key in mine}))
+    return ratio(*([np.array([median(errors)]) for errors in group] for group in groups))
 
 
 def table_of(sweep: Sweep) -> Result:

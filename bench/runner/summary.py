@@ -75,10 +75,10 @@ def print_statuses(plan: Plan) -> list[str]:
 def _print_contract_test(runs: Path, records: Sequence[Mapping[str, Any]]) -> None:
     """Prints the command of the contract test after the first runs of `renderer=custom`, and after one that failed."""
     custom = {record["id"]: record for record in records if record["renderer"] == CUSTOM_RENDERER}
-    has_failed = any(record["status"] != "ok" for record in custom.values())
+    faulty = [record for record in custom.values() if record["status"] in ("crashed", "nan")]
     all_runs = {path.parent.name for path in runs.glob(f"*-{CUSTOM_RENDERER}-*/record.json")}
-    if custom and (has_failed or all_runs <= {*custom}):
-        target = next(iter(custom.values()))["config"]["renderer"]["_target_"]
+    if custom and (faulty or all_runs <= {*custom}):
+        target = [*faulty, *custom.values()][0]["config"]["renderer"]["_target_"]
         print(f"does the renderer hold its contract? in a clone: {CONTRACT_TEST}{shlex.quote(target)}")
 
 

@@ -368,8 +368,8 @@ def failure_of(history: History, after: Evaluation) -> tuple[RunStatus, str] | N
         return after.failure
     first, last = history.objectives or (history.first_loss, history.curve[-1]["total"])
     measure = "objective" if history.objectives else "loss"
-    if isnan(last):
-        return RunStatus.NAN, f"the {measure} is not a number at the end"
+    if isnan(first) or isnan(last):
+        return RunStatus.NAN, f"the {measure} is not a number at the {'start' if isnan(first) else 'end'}"
     if last >= first and last > 0 and len(history.curve) > 1:
         return RunStatus.NOT_REACHED, f"the {measure} did not fall: {first:.4g} at the start, {last:.4g} at the end"
     return None

@@ -1,5 +1,6 @@
 """How large a prior a completion needs: the error over the cost, for several networks and lengths of codes."""
 
+from itertools import cycle
 from typing import Any
 
 from bench.records import format
@@ -7,16 +8,16 @@ from bench.report.study import Result, Runs, Selection, chart, compare, records,
 
 PLACE = 24
 READS = (Selection("prior_sizes", tuple(f"prior.network.{key}" for key in ("layers", "width", "code_length", "skip"))),)
-COLOURS = ("#f2a65a", "#2a6f97", "#7b2d26")  # of networks, the narrowest first
+COLOURS = ("#f2a65a", "#2a6f97", "#7b2d26", "#5c8001", "#845ec2")  # of lines, the narrowest network first
 NOTES = (
-    compare.ERROR,
+    "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000.",
     "Each row has a prior of its size, trained on the same shapes with the same number of steps. Ratios compare it "
-    "with the largest prior of the table, and are medians over shapes. A failed run has the largest error of all rows "
-    "on its shape.",
+    "with the largest prior of the same renderer, and are medians over shapes.",
+    "A failed run, or a planned run that was not made, counts as infinite in medians of errors. In ratios it has the "
+    "largest error of all rows on its shape. A row without a run that ended ok has no ratio.",
     "After a ratio stands the number of shapes on which the row is better. An interval that contains 1 does not show "
     "that errors are equal.",
-    "Numbers: the weights of the network; each shape has a code besides. FLOPs: those of all field evaluations of a "
-    "run.",
+    "FLOPs are those of all field evaluations of a run. The network has the weights; each shape has a code.",
 )
 Line = dict[str, Any]
 
@@ -31,7 +32,7 @@ def make(runs: Runs) -> Result:
         "Completion with priors of several sizes.",
         "Error of a completion, and the FLOPs of its field evaluations, over the length of the code.",
         question="How large a prior does a completion need?",
-        verdict=_verdict(pooled),
+        verdict=" ".join(_verdict([line for line in pooled if line["preset"] == name]) for name in _presets(pooled)),
         interval=compare.INTERVAL,
         estimates=[line["error"] for line in lines],
         remarks=NOTES,
@@ -45,7 +46,8 @@ def make(runs: Runs) -> Result:
 def _lines(runs: Runs, compared: compare.Compared) -> list[Line]:
     """The lines of the comparison with the sizes of priors, the smallest first, and ratios to the largest prior."""
     sizes = {row: _size(of_row[0]["config"]["prior"]["network"]) for row, of_row in runs.rows().items()}
-    largest = max(sizes, key=lambda row: (sizes[row]["numbers"], sizes[row]["code"]))
+    by_size = sorted(sizes, key=lambda row: (sizes[row]["weights"], sizes[row]["code"]))
+    largest = {row.preset: row for row in by_size}
     frame = runs.frame.assign(flops=runs.number("flops"))
     lines = []
     for line in compared.lines:
@@ -53,17 +55,22 @@ def _lines(runs: Runs, compared: compare.Compared) -> list[Line]:
         of_row = frame[(frame.status == "ok") & (frame.row == row.name)]
         if line["family"] != compare.ALL_FAMILIES:
             of_row = of_row[of_row.family == line["family"]]
-        ratio = None if row == largest else compared.gap(line["family"], row, largest)
+        reference = largest[row.preset]
+        ratio = None if row == reference or of_row.empty else compared.gap(line["family"], row, reference)
         flops = None if of_row.empty else float(of_row.flops.median())
         lines.append(line | sizes[row] | {"ratio": ratio, "flops": flops})
     families = list(dict.fromkeys(line["family"] for line in lines))
-    return sorted(lines, key=lambda line: (families.index(line["family"]), line["numbers"]))
+    return sorted(lines, key=lambda line: (families.index(line["family"]), line["preset"], line["weights"]))
+
+
+def _presets(lines: list[Line]) -> list[str]:
+    return list(dict.fromkeys(line["preset"] for line in lines))
 
 
 def _size(network: dict[str, Any]) -> Line:
     """The network in words, the length of its code, and the number of its weights."""
     layers, width, code = (network[key] for key in ("layers", "width", "code_length"))
-    return {"network": f"{layers} × {width}", "code": code, "numbers": weights(**network)}
+    return {"network": f"{layers} × {width}", "code": code, "weights": weights(**network)}
 
 
 def weights(layers: int, width: int, code_length: int, skip: int, *, narrow: bool) -> int:
@@ -76,45 +83,52 @@ def weights(layers: int, width: int, code_length: int, skip: int, *, narrow: boo
     return sum((i + 1) * o for i, o in zip([*inputs, width], [*sizes, 1], strict=True))
 
 
-def _verdict(pooled: list[Line]) -> str:
-    """The ratios of errors that differ significantly, and the cost of the cheapest prior whose ratio does not."""
-    named = [(line["row"], compare.ratio_of(line["ratio"])) for line in pooled]
-    tested = [(line, ratio) for line, (_, ratio) in zip(pooled, named, strict=True) if ratio and ratio.has_ends]
-    text = compare.differing(named, f"of errors, to {pooled[-1]['row']},")
-    if not tested:
-        return text
+def _verdict(lines: list[Line]) -> str:
+    """The significant ratios of a renderer's errors, and its cheapest prior without a significantly larger error."""
+    largest = lines[-1]
+    ratios = [(line["row"], compare.ratio_of(line["ratio"])) for line in lines]
+    text = compare.differing(ratios, f"of errors, to {largest['row']},")
+    tested = [(line, ratio) for line, (_, ratio) in zip(lines, ratios, strict=True) if ratio and ratio.has_ends]
     verdicts = statistics.ratio_verdicts([ratio for _, ratio in tested])
-    similar = [
+    worse = [
         line
-        for (line, _), verdict in zip(tested, verdicts, strict=True)
-        if verdict is statistics.Verdict.NOT_DISTINGUISHED and line["flops"]
+        for (line, ratio), verdict in zip(tested, verdicts, strict=True)
+        if verdict is statistics.Verdict.NOT_DECIDABLE or (verdict is statistics.Verdict.DIFFERS and ratio.value > 1)
     ]
-    if not similar or not pooled[-1]["flops"]:
+    candidates = [line for line in (*(line for line, _ in tested), largest) if line not in worse and line["flops"]]
+    if not tested or largest not in candidates:
         return text
-    cheapest = min(similar, key=lambda line: line["flops"])
-    share = table.percent(cheapest["flops"] / pooled[-1]["flops"])
-    ratio = format.number(cheapest["ratio"].ratio.value)
-    return f"{text} Of these, {cheapest['row']} needs the fewest FLOPs: {share}, with {ratio} times the error."
+    cheapest = min(candidates, key=lambda line: line["flops"])
+    if cheapest is largest:
+        return f"{text} Of the priors without a significantly larger error, none needs fewer FLOPs than the largest."
+    share, error = table.percent(cheapest["flops"] / largest["flops"]), format.number(cheapest["ratio"].ratio.value)
+    return (
+        f"{text} Of the priors without a significantly larger error, {cheapest['row']} needs the fewest FLOPs: {share} "
+        f"of those of the largest, with {error} times the error."
+    )
 
 
 def _panels(pooled: list[Line]) -> list[chart.Panel]:
-    """Error and FLOPs over the length of the code: a line per network."""
+    """Error and FLOPs over the length of the code: a line per network and renderer."""
+    several = len(_presets(pooled)) > 1
     panels = []
     for key, title in (("error", compare.LABEL), ("flops", "FLOPs of a run")):
         curves = []
-        for colour, network in zip(COLOURS, dict.fromkeys(line["network"] for line in pooled), strict=False):
-            lines = [line for line in pooled if line["network"] == network and line["flops"]]
+        groups = dict.fromkeys((line["network"], line["preset"]) for line in pooled)
+        for colour, (network, preset) in zip(cycle(COLOURS), groups, strict=False):
+            lines = [line for line in pooled if (line["network"], line["preset"]) == (network, preset)]
+            lines = [line for line in lines if line["flops"]]
             x, y = ([line[name] for line in lines] for name in ("code", key))
-            texts = [f"{line['numbers']:,} weights" for line in lines]
-            curve = chart.curve(f"network {network}", "", x, y, text=texts)
-            curves.append(curve | {"colour": colour, "symbol": "o"})
+            texts = [f"{line['weights']:,} weights" for line in lines]
+            name = f"network {network}{f', {preset}' if several else ''}"
+            curves.append(chart.curve(name, "", x, y, text=texts) | {"colour": colour, "symbol": "o"})
         panels.append(chart.panel_data("", "numbers of the code", title, curves))
     return panels
 
 
 COLUMNS = (
     *table.columns(table.word, family="Family", row="Prior"),
-    *table.columns(table.integer, numbers="Numbers"),
+    *table.columns(table.integer, weights="Weights"),
     *table.estimate("error", "Chamfer × 1000"),
     table.text("ratio", "Ratio to the largest", lambda line: "" if line["ratio"] is None else str(line["ratio"])),
     *table.ends("ratio", lambda line: compare.ratio_of(line["ratio"])),

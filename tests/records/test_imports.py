@@ -72,3 +72,10 @@ def test_a_run_depends_on_the_settings_of_a_renderer_that_it_loads_by_name(tmp_p
         hashes.append([code_hash({"task": task | {"beside": names}, "prior": {}}) for names in ([], ["dvr"])])
     (alone, loaded), (alone_later, loaded_later) = hashes
     assert alone == alone_later and loaded != loaded_later
+
+
+def test_a_run_of_a_class_of_the_user_depends_on_all_modules_and_kernels(monkeypatch):
+    hashed = []
+    monkeypatch.setattr(folder, "_file_hash", lambda path, **_: hashed.append(path.name) or "")
+    folder._our_code_hash.__wrapped__(frozenset(), True)
+    assert {"decoder.cpp", "dvr.py", "neus.py"} <= {*hashed}

@@ -7,6 +7,10 @@ from bench.report.data.statistics import ratio
 from bench.studies.prior_sizes import _verdict, weights
 from renderers.fields.mlp import Decoder
 from tests.looped import each
+from tests.report.test_report_paper import page_of, write_run
+
+ALIKE, WORSE, BETTER = [0.9, 1.1] * 8, [1.5, 1.6] * 8, [0.4, 0.5] * 8
+SIZES = {"small": (64, 8), "large": (128, 64)}
 
 
 @each("skip, narrow", [(0, False), (2, False), (2, True)])
@@ -20,11 +24,27 @@ def line(row: str, errors: list[float], flops: float) -> dict:
     return {"row": row, "flops": flops, "ratio": Gap(ratio([np.array([e]) for e in errors], largest), 0, len(errors))}
 
 
-def test_the_verdict_names_the_cheapest_prior_whose_error_does_not_differ():
-    alike, worse = [0.9, 1.1] * 8, [1.5, 1.6] * 8
+@each("small, middle_flops, words", [
+    (WORSE, 50.0, "middle needs the fewest FLOPs: 50 %"), (ALIKE, 50.0, "small needs the fewest FLOPs: 10 %"),
+    (BETTER, 50.0, "small needs the fewest FLOPs: 10 %"), (WORSE, 130.0, "none needs fewer FLOPs than the largest"),
+])  # fmt: skip
+def test_the_verdict_names_the_cheapest_prior_without_a_larger_error(small, middle_flops, words):
     largest = {"row": "large", "flops": 100.0, "ratio": None}
-    text = _verdict([line("small", worse, 10.0), line("middle", alike, 50.0), largest])
-    assert "*1 of 2* ratios of errors, to large, differ significantly from 1: small" in text
-    assert "middle needs the fewest FLOPs: 50 %" in text
-    assert "fewest FLOPs: 10 %" in _verdict([line("small", alike, 10.0), line("middle", alike, 50.0), largest])
-    assert "fewest" not in _verdict([line("small", worse, 10.0), largest])
+    text = _verdict([line("small", small, 10.0), line("middle", ALIKE, middle_flops), largest])
+    assert words in text and ("small 1.5" in text) == (small is WORSE)
+
+
+def test_priors_are_compared_within_a_renderer_and_a_failed_prior_has_no_ratio(tmp_path):
+    for renderer, factor in (("dist", 1.0), ("dvr", 3.0)):
+        for name, (width, code) in SIZES.items():
+            network = {"layers": 2, "width": width, "code_length": code, "skip": 0, "narrow": False}
+            for index in range(6):
+                failed = renderer == "dvr" and name == "small"
+                write_run(
+                    tmp_path, "prior_sizes", f"{name}, {renderer}", renderer=renderer, index=index,
+                    metrics={"chamfer_l2": factor * width}, settings={"prior": {"network": network}},
+                    scene=f"car {index}", flops=factor * width, status="crashed" if failed else "ok",
+                )  # fmt: skip
+    lines = page_of(tmp_path, "prior_sizes").data.set_index("row")
+    assert lines.loc["small, dist", "ratio"].startswith("0.500") and lines.loc["small, dvr", "ratio"] == ""
+    assert lines.loc["large, dist", "ratio"] == lines.loc["large, dvr", "ratio"] == ""
