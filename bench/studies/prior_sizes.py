@@ -90,13 +90,13 @@ def _verdict(lines: list[Line]) -> str:
     text = compare.differing(ratios, f"of errors, to {largest['row']},")
     tested = [(line, ratio) for line, (_, ratio) in zip(lines, ratios, strict=True) if ratio and ratio.has_ends]
     verdicts = statistics.ratio_verdicts([ratio for _, ratio in tested])
-    worse = [
-        line
-        for (line, ratio), verdict in zip(tested, verdicts, strict=True)
-        if verdict is statistics.Verdict.NOT_DECIDABLE or (verdict is statistics.Verdict.DIFFERS and ratio.value > 1)
+    is_larger = [
+        ratio.value > 1 and verdict is statistics.Verdict.DIFFERS
+        for (_, ratio), verdict in zip(tested, verdicts, strict=True)
     ]
-    candidates = [line for line in (*(line for line, _ in tested), largest) if line not in worse and line["flops"]]
-    if not tested or largest not in candidates:
+    similar = [line for (line, _), larger in zip(tested, is_larger, strict=True) if not larger]
+    candidates = [line for line in (*similar, largest) if line["flops"]]
+    if not tested or statistics.Verdict.NOT_DECIDABLE in verdicts or largest not in candidates:
         return text
     cheapest = min(candidates, key=lambda line: line["flops"])
     if cheapest is largest:

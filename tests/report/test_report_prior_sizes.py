@@ -31,6 +31,8 @@ def line(row: str, errors: list[float], flops: float) -> dict:
 def test_the_verdict_names_the_cheapest_prior_without_a_larger_error(small, middle_flops, words):
     largest = {"row": "large", "flops": 100.0, "ratio": None}
     text = _verdict([line("small", small, 10.0), line("middle", ALIKE, middle_flops), largest])
+    too_few_shapes = [line(name, [1.1] * 6, 10.0) for name in "abc"]
+    assert "fewest" not in _verdict([*too_few_shapes, largest])
     assert words in text and ("small 1.5" in text) == (small is WORSE)
 
 
