@@ -7,7 +7,8 @@ from bench.records import format
 from bench.report.study import Result, Runs, Selection, chart, compare, records, statistics, table
 
 PLACE = 24
-READS = (Selection("prior_sizes", tuple(f"prior.network.{key}" for key in ("layers", "width", "code_length", "skip"))),)
+SIZES = tuple(f"prior.network.{key}" for key in ("layers", "width", "code_length", "skip"))
+READS = (Selection("prior_sizes", SIZES, setup=("scenes", "pixels", "machine")),)
 COLOURS = ("#f2a65a", "#2a6f97", "#7b2d26", "#5c8001", "#845ec2")  # of lines, the narrowest network first
 NOTES = (
     "Error: chamfer_l2, the sum of the two mean squared distances in squared scene units, times 1000.",
