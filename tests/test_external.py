@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -185,8 +186,12 @@ def test_a_time_limit_ends_the_code_and_its_children(code, changed, tmp_path):
     record = run_of(recipe, code, tmp_path, "task.time_limit=1")
     assert record.status == "timeout" and record.reason.startswith("the code took more than 1 s: type time_limit=")
     child = int((tmp_path / "external" / "child").read_text())
-    with contextlib.suppress(psutil.NoSuchProcess):  # a process that has ended may wait for its parent
-        assert psutil.Process(child).status() in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+    ended = (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)  # a process that has ended may wait for its parent
+    deadline = time.monotonic() + 30
+    with contextlib.suppress(psutil.NoSuchProcess):
+        while psutil.Process(child).status() not in ended:  # a killed process ends when it is scheduled
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
 
 
 def test_an_unknown_recipe_and_an_unknown_key_are_named_with_the_nearest(changed, capsys):

@@ -101,11 +101,11 @@ def _verdict(lines: list[Line]) -> str:
         return text
     cheapest = min(candidates, key=lambda line: line["flops"])
     if cheapest is largest:
-        return f"{text} Of the priors without a significantly larger error, none needs fewer FLOPs than the largest."
+        return f"{text} Every prior with fewer FLOPs has a significantly larger error."
     share, error = table.percent(cheapest["flops"] / largest["flops"]), format.number(cheapest["ratio"].ratio.value)
     return (
-        f"{text} Of the priors without a significantly larger error, {cheapest['row']} needs the fewest FLOPs: {share} "
-        f"of those of the largest, with {error} times the error."
+        f"{text} Without a significantly larger error, {cheapest['row']} needs the fewest FLOPs: {share} of those of "
+        f"the largest, with {error} times the error."
     )
 
 

@@ -186,7 +186,9 @@ class PixelGrid:
         is_candidate: Bool[Tensor, " n"],
     ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, " k"]]:
         """Candidates whose pixel is split by the line of a neighbour, the nearest one: line, ray, and covered share."""
-        row = torch.full_like(is_candidate, -1, dtype=near.dtype).index_put((near,), torch.arange(len(near)).to(near))
+        row = torch.full_like(is_candidate, -1, dtype=near.dtype).index_put(
+            (near,), torch.arange(len(near), device=near.device, dtype=near.dtype)
+        )
         inside, outside = self.pairs
         used = is_candidate[inside] & (row[outside] >= 0)
         ray, line = inside[used], row[outside[used]]

@@ -26,7 +26,7 @@ def line(row: str, errors: list[float], flops: float) -> dict:
 
 @each("small, middle_flops, words", [
     (WORSE, 50.0, "middle needs the fewest FLOPs: 50 %"), (ALIKE, 50.0, "small needs the fewest FLOPs: 10 %"),
-    (BETTER, 50.0, "small needs the fewest FLOPs: 10 %"), (WORSE, 130.0, "none needs fewer FLOPs than the largest"),
+    (BETTER, 50.0, "small needs the fewest FLOPs: 10 %"), (WORSE, 130.0, "Every prior with fewer FLOPs has a"),
 ])  # fmt: skip
 def test_the_verdict_names_the_cheapest_prior_without_a_larger_error(small, middle_flops, words):
     largest = {"row": "large", "flops": 100.0, "ratio": None}

@@ -51,7 +51,7 @@ def assert_one_line(err: str, *words: str) -> None:
 
 @each("arguments, words", [
     ("task=compleetion", ("unknown task 'compleetion'", "did you mean completion")),
-    ("renderer=zzz", ("unknown renderer 'zzz'", "custom, dist, dvr, idr, mesh_proxy, naive, neus", "and variants")),
+    ("renderer=zzz", ("unknown renderer 'zzz'", "custom, dist, dvr, edge_sampling, idr, mesh_proxy", "and variants")),
     ("experiment=table1", ("experiment is not chosen by default", "write +experiment=NAME")),
     ("dataset=meshes/cow.obj", ("unknown dataset 'meshes/cow.obj'", "dataset=mesh dataset.path=meshes/cow.obj")),
     ("+sede=1", ("unknown key 'sede'", "did you mean seed")),
