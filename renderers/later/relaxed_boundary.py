@@ -1,7 +1,7 @@
 """Sphere tracing with a band about the silhouette that carries its gradient (Wang et al., SIGGRAPH Asia 2024)."""
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -78,6 +78,7 @@ class RelaxedBoundary(SurfaceRenderer):
         return replace(rendering, volume=Volume(torch.cat([near, hit]), distances, weights))
 
 
+@runtime_checkable
 class Marching(Protocol):
     """The settings of a march; see `RelaxedBoundary`."""
 

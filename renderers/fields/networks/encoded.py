@@ -6,7 +6,7 @@ level. Neuralangelo (Li et al. 2023) takes central differences instead, which re
 
 from dataclasses import dataclass
 from math import pi
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -21,6 +21,7 @@ FLOPS_PER_SINE = 20  # an estimate, also for the cosine
 FLOPS_PER_LEVEL, FLOPS_PER_FEATURE = 110, 16  # an estimate: eight indices and weights; eight products and sums
 
 
+@runtime_checkable
 class Encoding(Protocol):
     """A function from points to features, without the points."""
 
