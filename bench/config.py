@@ -224,8 +224,8 @@ def build(
         raise ValueError(_missing_values_message(cls, name, missing))
     for key in arguments:
         if argument_names is not None and key not in argument_names:
-            is_foreign = name == "renderer" and not is_custom and cls.__module__.partition(".")[0] not in OUR_PACKAGES
-            hint = f"; {custom_renderer_hint(_class_path(cls))}" if is_foreign else ""
+            needs_custom = name == "renderer" and not is_custom and _is_of_user(cls)
+            hint = f"; {custom_renderer_hint(_class_path(cls))}" if needs_custom else ""
             raise ValueError(f"{name} has no key {key!r}{nearest(key, argument_names)}{hint}")
     return _build_dataclass(cls, arguments, name, packages) if is_dataclass(cls) else cls(**arguments)
 
@@ -374,8 +374,8 @@ def _build_dataclass(cls: type, arguments: dict[str, Any], name: str, packages: 
     no_default = dataclasses.MISSING
     required = [item.name for item in fields(cls) if item.default is item.default_factory is no_default]
     if missing := [key for key in required if key not in values]:
-        is_foreign = name == "renderer" and cls.__module__.partition(".")[0] not in OUR_PACKAGES
-        raise ValueError(_missing_values_message(cls, name, missing, plus="+" if is_foreign else ""))
+        plus = "+" if name == "renderer" and _is_of_user(cls) else ""
+        raise ValueError(_missing_values_message(cls, name, missing, plus=plus))
     try:
         return cls(**values)
     except ValueError as error:  # the class of a nested node does not know its key
@@ -404,6 +404,10 @@ def _node_class(wanted: Any) -> type | None:
 def _protocol(wanted: Any) -> type | None:
     """The protocol in a field's type, such as `X` or `X | None`; None if there is no protocol."""
     return next((cls for cls in (wanted, *get_args(wanted)) if getattr(cls, "_is_protocol", False)), None)
+
+
+def _is_of_user(cls: type) -> bool:
+    return cls.__module__.partition(".")[0] not in OUR_PACKAGES
 
 
 def _class_path(cls: type) -> str:

@@ -50,9 +50,7 @@ def describe(device: torch.device) -> dict[str, Any]:
         "implicit_bench": version("implicit-bench") or "",
         "python": platform.python_version(),
         **{package.replace("-", "_"): version(package) for package in PACKAGES},
-        "torch": str(
-            torch.__version__
-        ),  # includes the build; a plain str, as its class would load torch in the parent process
+        "torch": str(torch.__version__),  # with the build; its own class would load torch in the parent process
         "platform": platform.platform(),
         "cpu": cpu_name(),
         "cores": os.cpu_count(),

@@ -74,6 +74,19 @@ def ratio_of(gap: Gap | None) -> Interval | None:
     return None if gap is None else gap.ratio
 
 
+def pooled(lines: Sequence[Line]) -> list[Line]:
+    """The lines over all families, which come first."""
+    return [line for line in lines if line["family"] == lines[0]["family"]]
+
+
+def ratio_columns(heading: str) -> list[Column]:
+    """The columns of a `Gap`, empty for the reference row, and of the ends of its interval."""
+    return [
+        text("ratio", heading, lambda line: "" if line["ratio"] is None else str(line["ratio"])),
+        *ends("ratio", lambda line: ratio_of(line["ratio"])),
+    ]
+
+
 @dataclass(frozen=True)
 class Compared:
     """The runs of a comparison.
@@ -210,8 +223,7 @@ class Compared:
 
     @property
     def pooled(self) -> list[Line]:
-        """The lines over all families."""
-        return [line for line in self.lines if line["family"] == self.lines[0]["family"]]
+        return pooled(self.lines)
 
     @cached_property
     def oracles(self) -> dict[str, float]:
@@ -255,8 +267,7 @@ class Compared:
             *columns(word, family="Family", row="Method"),
             *columns(**{condition: heading(condition) for condition in self.conditions}),
             *estimate("error", "Median over shapes"),
-            text("ratio", ratio, lambda line: "" if line["ratio"] is None else str(line["ratio"])),
-            *ends("ratio", lambda line: ratio_of(line["ratio"])),
+            *ratio_columns(ratio),
             *columns(format.count, evaluations="Field evaluations"),
             *columns(format.seconds, seconds="Runtime"),
             *columns(word, failed="Failed", preset=""),

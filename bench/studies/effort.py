@@ -43,7 +43,7 @@ def make(runs: Runs) -> Result:
     compared = compare.Compared(runs, FULL["dist_needed"])
     frame = runs.frame.assign(cost=runs.number("evaluations_cost"))
     lines = _lines(compared, frame[frame.status == "ok"].pivot_table("cost", ["family", "solid", "seed"], "row"))
-    pooled = [line for line in lines if line["family"] == lines[0]["family"]]
+    pooled = compare.pooled(lines)
     panel = _panel(pooled)
     return Result(
         runs,
@@ -124,8 +124,7 @@ def _panel(pooled: list[Line]) -> chart.Panel:
 COLUMNS = (
     *table.columns(table.word, family="Family", row="Method"),
     *table.estimate("error", "Chamfer × 1000"),
-    table.text("ratio", "Error ratio", lambda line: "" if line["ratio"] is None else str(line["ratio"])),
-    *table.ends("ratio", lambda line: compare.ratio_of(line["ratio"])),
+    *compare.ratio_columns("Error ratio"),
     table.text("cost_ratio", "Cost ratio", lambda line: "" if line["cost_ratio"] is None else str(line["cost_ratio"])),
     *table.columns(format.count, cost="Field evaluations"),
     *table.columns(table.word, failed="Failed", preset=""),

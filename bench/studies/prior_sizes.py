@@ -26,7 +26,7 @@ Line = dict[str, Any]
 def make(runs: Runs) -> Result:
     """A line per family and prior, those over all families first."""
     lines = _lines(runs, compare.Compared(runs, ""))
-    pooled = [line for line in lines if line["family"] == lines[0]["family"]]
+    pooled = compare.pooled(lines)
     panels = _panels(pooled)
     return Result(
         runs,
@@ -49,17 +49,13 @@ def _lines(runs: Runs, compared: compare.Compared) -> list[Line]:
     sizes = {row: _size(of_row[0]["config"]["prior"]["network"]) for row, of_row in runs.rows().items()}
     by_size = sorted(sizes, key=lambda row: (sizes[row]["weights"], sizes[row]["code"]))
     largest = {row.preset: row for row in by_size}
-    frame = runs.frame.assign(flops=runs.number("flops"))
-    lines = []
+    all_flops, lines = runs.number("flops"), []
     for line in compared.lines:
         row = records.Row(line["preset"], line["row"])
-        of_row = frame[(frame.status == "ok") & (frame.row == row.name)]
-        if line["family"] != compare.ALL_FAMILIES:
-            of_row = of_row[of_row.family == line["family"]]
-        reference = largest[row.preset]
-        ratio = None if row == reference or of_row.empty else compared.gap(line["family"], row, reference)
-        flops = None if of_row.empty else float(of_row.flops.median())
-        lines.append(line | sizes[row] | {"ratio": ratio, "flops": flops})
+        cells, reference = compared.cells_of(line["family"], row), largest[row.preset]
+        flops = all_flops[cells.index[cells.ok]]
+        ratio = None if row == reference or flops.empty else compared.gap(line["family"], row, reference)
+        lines.append(line | sizes[row] | {"ratio": ratio, "flops": None if flops.empty else float(flops.median())})
     families = list(dict.fromkeys(line["family"] for line in lines))
     return sorted(lines, key=lambda line: (families.index(line["family"]), line["preset"], line["weights"]))
 
@@ -131,8 +127,7 @@ COLUMNS = (
     *table.columns(table.word, family="Family", row="Prior"),
     *table.columns(table.integer, weights="Weights"),
     *table.estimate("error", "Chamfer × 1000"),
-    table.text("ratio", "Ratio to the largest", lambda line: "" if line["ratio"] is None else str(line["ratio"])),
-    *table.ends("ratio", lambda line: compare.ratio_of(line["ratio"])),
+    *compare.ratio_columns("Ratio to the largest"),
     *table.columns(format.count, evaluations="Field evaluations", flops="FLOPs"),
     *table.columns(table.word, failed="Failed", preset=""),
 )

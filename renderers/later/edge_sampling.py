@@ -141,7 +141,7 @@ def _towards_surface(field: Field, points: Float[Tensor, "m 3"]) -> Float[Tensor
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """An image of n rays in one row.
+    """An image of n flattened rays.
 
     Args:
         steps: from a ray to the next one, to the right and down, of origins and directions.

@@ -26,6 +26,24 @@ OCCUPANCY_THRESHOLD = 0.5  # tau in DVR
 COLOUR_LOGIT_SCALE = 20.0  # makes one step size of Adam suit the colours and the distances of a grid
 
 
+def _colour_network(features: int, width: int, *, directional: bool) -> nn.ModuleList:
+    """The layers from features, point, normal and, if directional, encoded direction to a colour."""
+    direction_inputs = 3 + 6 * DIRECTION_OCTAVES if directional else 0
+    return nn.ModuleList(nn.Linear(*pair) for pair in pairwise([features + 6 + direction_inputs, width, width, 3]))
+
+
+def _colours(
+    network: nn.ModuleList, features: Tensor, points: Vectors, normals: Vectors, directions: Vectors | None
+) -> Vectors:
+    """The colours by the layers of `_colour_network`; None for one that is not directional."""
+    encoded = [] if directions is None else [positional_encoding(directions, DIRECTION_OCTAVES)]
+    hidden = torch.cat([features, points, normals, *encoded], dim=-1)
+    *layers, last = network
+    for layer in layers:
+        hidden = layer(hidden).relu_()
+    return torch.sigmoid(last(hidden))
+
+
 class ColouredDistance(nn.Module):
     """A distance network, and a colour network that takes its features, the point, the normal and the view direction.
 
@@ -57,9 +75,7 @@ class ColouredDistance(nn.Module):
         inputs = [3 + 6 * octaves] + [width] * (layers - 1)
         self.hidden = nn.ModuleList(nn.Linear(size, width) for size in inputs)
         self.last, self.features = nn.Linear(width, 1), nn.Linear(width, width)
-        direction_inputs = 3 + 6 * DIRECTION_OCTAVES if directional else 0
-        sizes = [width + 6 + direction_inputs, width, width, 3]
-        self.colour = nn.ModuleList(nn.Linear(*pair) for pair in pairwise(sizes))
+        self.colour = _colour_network(width, width, directional=directional)
         self._initialise_to_sphere(radius)
 
     @torch.no_grad()
@@ -93,12 +109,8 @@ class ColouredDistance(nn.Module):
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`; directions are unused unless `directional`."""
-        direction_encoding = [positional_encoding(directions, DIRECTION_OCTAVES)] if self.directional else []
-        features = torch.cat([self.features(self._hidden(points)), points, normals, *direction_encoding], dim=-1)
-        *layers, last = self.colour
-        for layer in layers:
-            features = layer(features).relu_()
-        return torch.sigmoid(last(features))
+        features = self.features(self._hidden(points))
+        return _colours(self.colour, features, points, normals, directions if self.directional else None)
 
     def _hidden(self, points: Tensor) -> Tensor:
         features = positional_encoding(points, self.octaves)
@@ -140,10 +152,7 @@ class ColouredEncoded(nn.Module):
             self.register_buffer("frequencies", encoding.frequencies)
         features = self.encoding(torch.zeros(1, 3)).shape[1]
         self.distance = nn.ModuleList(nn.Linear(*pair) for pair in pairwise([3 + features, *[width] * layers, 1]))
-        direction_inputs = 3 + 6 * DIRECTION_OCTAVES if directional else 0
-        self.colour = nn.ModuleList(
-            nn.Linear(*pair) for pair in pairwise([features + 6 + direction_inputs, width, width, 3])
-        )
+        self.colour = _colour_network(features, width, directional=directional)
         self._initialise_to_sphere(radius)
 
     @torch.no_grad()
@@ -191,12 +200,8 @@ class ColouredEncoded(nn.Module):
 
     def colours(self, points: Vectors, normals: Vectors, directions: Vectors) -> Vectors:
         """See `Coloured`; directions are unused unless `directional`."""
-        direction_encoding = [positional_encoding(directions, DIRECTION_OCTAVES)] if self.directional else []
-        features = torch.cat([self.encoding(points), points, normals, *direction_encoding], dim=-1)
-        *layers, last = self.colour
-        for layer in layers:
-            features = layer(features).relu()
-        return torch.sigmoid(last(features))
+        directions_used = directions if self.directional else None
+        return _colours(self.colour, self.encoding(points), points, normals, directions_used)
 
 
 class ColouredOccupancy(nn.Module):
