@@ -10,8 +10,6 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bench.records import format
 from bench.records.metrics import HIGHER, LISTED_METRICS, LOWER, Metric, better_direction
 from bench.records.names import differences
@@ -51,10 +49,7 @@ SMALL_POINTS = (
     "Costs are medians over runs that ended ok."
 )
 FRONT = "Grey steps: the front, of the rows for which no other is both cheaper and better."
-RATIO = (
-    "A ratio is the median over shapes of the ratios of errors, which are medians over seeds. Its interval is of the "
-    "sign test."
-)
+RATIO = "A ratio is the median over shapes of ratios of medians over seeds; its interval is of the sign test."
 UNDIRECTED = "Of metrics of which neither direction is better, medians are of the runs that have them."
 
 
@@ -223,20 +218,17 @@ def _ratio(runs: list[Record], first: list[Record], metric: str) -> Interval | N
     mine, theirs = ({run_key(run): error(run, metric) for run in row} for row in (runs, first))
     if not metric or runs is first or set(mine) != set(theirs):
         return None
-    groups = (by_shape(mine), by_shape({key: theirs[key] for key in mine}))
-    return ratio(*([np.array([median(errors)]) for errors in group] for group in groups))
+    return ratio(by_shape(mine), by_shape({key: theirs[key] for key in mine}), of_shape=median)
 
 
 def table_of(sweep: Sweep) -> Result:
     table_lines, names = lines(sweep), sweep.metrics
     headings = {name: LISTED_METRICS[name] for name in names if name in LISTED_METRICS}
     headings = headings or {name: Metric(name) for name in names[:MAX_FALLBACK_METRICS]}
-    stress = any(record["config"].get("stress") for record in sweep.runs.records)
     csv_only = [name for name in names if name not in headings]
     has_interval = [line[name].has_ends for line in table_lines for name in headings if line[name] is not None]
     has_ratio = any(line["ratio"] is not None for line in table_lines)
-    kinds = ["95 % bootstrap intervals over shapes" if any(has_interval) else ""]
-    kinds += [] if all(has_interval) else [f"{FEW}: no interval"]
+    kinds = {"95 % bootstrap intervals over shapes": any(has_interval), f"{FEW}: no interval": not all(has_interval)}
     lead = names[0] if names and names[0] in headings and better_direction(names[0]) else ""
     panels = [_panels(sweep, dataset, lead, headings[lead]) for dataset in sweep.datasets or [""]] if lead else []
     rows = sum(map(bool, panels))
@@ -253,8 +245,8 @@ def table_of(sweep: Sweep) -> Result:
         folders={
             row: [run["folder"] for run in runs] for row, runs in grouped(sweep.runs.records, itemgetter("row")).items()
         },
-        n=f"{len(sweep.runs.records)} runs" if stress else "",
-        interval="; ".join(filter(None, kinds)) if headings else "",
+        n=f"{len(sweep.runs.records)} runs" if any(run["config"].get("stress") for run in sweep.runs.records) else "",
+        interval="; ".join(text for text, is_shown in kinds.items() if is_shown) if headings else "",
         figure=chart.draw(panels, height, rows, legend=3) if panels else None,
         chart={"panels": panels, "note": note} if panels else None,
         remarks=(

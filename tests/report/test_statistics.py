@@ -319,3 +319,11 @@ def test_where_both_fail_on_a_shape_the_ratio_is_1():
     assert (found.value, found.low, found.high) == pytest.approx((2.0, 1.0, 2.0))
     apart = ratio([failed] * 3 + [good] * 3, [good] * 3 + [failed] * 3)  # neither is known to be better
     assert math.isnan(apart.value) and (apart.low, apart.high) == (0.0, math.inf)
+
+
+def test_a_shape_may_have_views_and_its_runs_another_statistic_than_the_geometric_mean():
+    groups = [[np.array([1.0, 2.0]), np.array([math.inf])], [np.array([4.0]), np.array([6.0])]]
+    doubled = [[2 * view for view in views] for views in groups]
+    assert ratio(doubled, groups, of_shape=median).points == (2.0, 2.0)
+    ones = [[np.array([1.0, 1.0]), np.array([1.0])], groups[1]]
+    assert ratio(groups, ones, of_shape=median).points == (2.0, 1.0)  # one failed run of three leaves it finite

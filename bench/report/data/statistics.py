@@ -117,20 +117,23 @@ def typical(groups: Groups) -> Interval:
     Returns:
         The ends are nan with fewer than `MIN_SHAPES` shapes; the median and the ends may be infinite.
     """
-    return _median_interval(_shape_means(groups))
+    return _median_interval(_shape_values(groups, geometric_mean))
 
 
-def ratio(first: Groups, second: Groups) -> Interval:
+def ratio(first: Groups, second: Groups, *, of_shape: Statistic = geometric_mean) -> Interval:
     """The median over shapes of the ratio of two errors, each the geometric mean of the shape's runs; see `typical`.
 
     If both fail on a shape, its ratio is 1: neither is better.
+
+    Args:
+        of_shape: the statistic of the runs of a shape, in place of the geometric mean.
 
     Raises:
         ValueError: the two do not have the same shapes with the same numbers of views and seeds.
     """
     if _sizes(first) != _sizes(second):
         raise ValueError(f"{_UNEQUAL_SHAPES} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
-    return _median_interval(_ratio(_shape_means(first), _shape_means(second)))
+    return _median_interval(_ratio(*(_shape_values(each, of_shape) for each in (first, second))))
 
 
 def shape_groups(values: Any) -> list[np.ndarray]:
@@ -199,8 +202,8 @@ def _sign_test_p_value(points: Sequence[float]) -> float:
     return min(1.0, 2 * float(special.bdtr(min(below, above), below + above, 0.5)))
 
 
-def _shape_means(groups: Groups) -> np.ndarray:
-    return np.array([geometric_mean(flat([group])) for group in groups])
+def _shape_values(groups: Groups, statistic: Statistic) -> np.ndarray:
+    return np.array([statistic(flat([group])) for group in groups])
 
 
 def _median_interval(points: np.ndarray) -> Interval:
