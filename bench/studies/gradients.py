@@ -38,6 +38,8 @@ VISIBLE_NOTES = (
     "of the occupancy, relaxed boundary: the band). A pixel at the outline is about 0.01 scene units wide.",
     "A blur of a pixel or more moves the gradient to neighbouring pixels. This lowers the cosine and the scale of a "
     "pixel, but not the sum over the image.",
+    "These rays are no image, so edge sampling splits no pixels here. It has a band, as the relaxed boundary has, and "
+    "nearly the same numbers. The page outline has it with whole images.",
     "For a disc, with default settings, the central difference has an error of 0.07 and a cosine of 0.997, because few "
     "rays of a pixel change sides.",
 )
