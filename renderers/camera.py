@@ -13,11 +13,16 @@ class Rays:
 
     With `image`, the last two leading dimensions are the rows and columns of an image, so that neighbours in the tensor
     are neighbours in the view.
+
+    Args:
+        cells: of rays [height, width, n], one in each of k x k = n squares of each pixel, column by column: an image
+            [height k, width k] through the centres of the squares, with the gradient of the rays. None for other rays.
     """
 
     origins: Float[Tensor, "*rays 3"]
     directions: Float[Tensor, "*rays 3"]
     image: bool = False
+    cells: "Rays | None" = None
 
     def __post_init__(self) -> None:
         if self.origins.shape != self.directions.shape or self.origins.shape[-1:] != (3,):
@@ -55,7 +60,8 @@ class Rays:
 
     def to(self, device: torch.device) -> "Rays":
         """The same rays on a device."""
-        return _rays_unchecked(self.origins.to(device), self.directions.to(device), self.image)
+        cells = None if self.cells is None else self.cells.to(device)
+        return _rays_unchecked(self.origins.to(device), self.directions.to(device), self.image, cells)
 
     def coarser(self, factor: int) -> "Rays":
         """One ray for each block of factor x factor pixels, through the middle of the block; image rays only.
@@ -69,10 +75,10 @@ class Rays:
         )
 
 
-def _rays_unchecked(origins: Tensor, directions: Tensor, image: bool = False) -> Rays:
+def _rays_unchecked(origins: Tensor, directions: Tensor, image: bool = False, cells: Rays | None = None) -> Rays:
     """Builds Rays without validation, only from parts of Rays that were already validated."""
     rays = object.__new__(Rays)
-    for name, value in (("origins", origins), ("directions", directions), ("image", image)):
+    for name, value in (("origins", origins), ("directions", directions), ("image", image), ("cells", cells)):
         object.__setattr__(rays, name, value)
     return rays
 

@@ -1,5 +1,6 @@
 """Several rays per pixel: random rays in its area, and what they predict of the pixel."""
 
+from dataclasses import replace
 from math import isqrt
 
 import torch
@@ -18,7 +19,8 @@ def random_rays(camera: Camera, count: int, seed: int, iteration: int) -> Rays:
     side, shape = isqrt(count), (camera.height, camera.width, count, 2)
     corner = torch.cartesian_prod(torch.arange(side), torch.arange(side))
     inside = torch.rand(shape, generator=generator_of(seed + SEED_OF_RAYS, iteration))
-    return camera.rays(((corner + inside) / side - 0.5).to(camera.intrinsics))
+    rays = camera.rays(((corner + inside) / side - 0.5).to(camera.intrinsics))
+    return replace(rays, cells=camera.resized(camera.height * side, camera.width * side).rays())
 
 
 def mean_depth(

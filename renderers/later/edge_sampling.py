@@ -1,6 +1,7 @@
 """Sphere tracing with the gradient of the silhouette from points on the outline (IRON, CVPR 2022)."""
 
 from dataclasses import dataclass, replace
+from math import isqrt
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -27,7 +28,8 @@ class EdgeSampling(SurfaceRenderer):
     The outline next to a ray is the line through an edge point, a point of the surface whose normal is perpendicular to
     the ray. A ray that misses reaches it from its near miss, the first local minimum of the field within a pixel. A ray
     that hits takes the line of a neighbour that misses. A pixel is covered by 1/2 minus its centre's distance from the
-    line over the pixel's width. The derivative of this distance is that of the edge point along its normal.
+    line over the pixel's width. The derivative of this distance is that of the edge point along its normal. With
+    several rays per pixel, each one's square (`Rays.cells`) is split as a pixel is, wherever the ray is in it.
 
     Source: IRON (Zhang et al. 2022, arXiv 2204.02232), Sec. 3.3: edge points, and pixels that they split.
     Differentiable in: field parameters and rays. Hits by the implicit rule, exactly, up to `epsilon`. In images of rays
@@ -36,13 +38,13 @@ class EdgeSampling(SurfaceRenderer):
     Needs: a distance or a bound inside the sphere; near misses are searched within a pixel's width, in field units.
     Deviates from the paper: an edge point is projected from a near miss, not walked to along the surface; neighbours
         share it; the split does not depend on the outline's direction in the pixel; only the first surface within a
-        pixel counts. Rays that are no image have no neighbours: a near miss within `width` has the weight 0, and the
-        derivative as in `RelaxedBoundary`, at the edge point. The mask loss is IDR's.
+        pixel counts. Rays without an image or cells have no neighbours: a near miss within `width` has the weight 0,
+        and the derivative as in `RelaxedBoundary`, at the edge point. The mask loss is IDR's.
 
     Args:
         steps: maximum marching steps per ray.
         epsilon: a ray has converged if the field's magnitude is below this, in scene units.
-        width: of the band of rays that are no image, in field units.
+        width: of the band of rays without an image or cells, in field units.
         least_slope, mask_sharpness, mask_weight, sphere_radius: see `silhouette.SurfaceRenderer`.
     """
 
@@ -69,7 +71,7 @@ class EdgeSampling(SurfaceRenderer):
         check_kind(self, field)
         flat, pixels = rays.flat(), PixelGrid.of(rays)
         with torch.no_grad():
-            band = self.width if pixels is None else pixels.widths(sphere_span(flat, self.sphere_radius)[1]).max()
+            band = self.width if pixels is None else pixels.reach(sphere_span(flat, self.sphere_radius)[1])
             front, near_distance, near_value = march_past_near_misses(self, field, flat, band)
         rendering = implicit_rendering(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)
         near = near_value.isfinite().nonzero().squeeze(-1)
@@ -82,13 +84,13 @@ class EdgeSampling(SurfaceRenderer):
             band_gap = self.width * lines.gap.detach() / near_value[near]  # the width in scene units
             weight, split = (lines.gap.detach() - lines.gap) / band_gap, torch.ones_like(near).bool()
         else:
-            weight = 0.5 - lines.gap / pixels.spacing(near, lines.distance, lines.normal)
+            weight = pixels.covered_share(near, lines)
             split = weight.detach() > 0
         outer, outer_weight = near[split], weight[split]
         hit_weight = hit_weight.index_put((outer,), 1 - outer_weight)
         samples = [(outer, lines.distance[split], outer_weight)]
         if pixels is not None:
-            line, inner, inner_weight = pixels.hits_beside(lines, near, flat, hit & (hit_weight == 1))
+            line, inner, inner_weight = pixels.hits_beside(lines, near, hit & (hit_weight == 1))
             hit_weight = hit_weight.index_put((inner,), inner_weight)
             has_behind = hit[near[line]]
             behind = distance[near[line[has_behind]]]
@@ -128,7 +130,7 @@ class OutlineLines:
         gap = (normal * (points - approached)).sum(-1) + value / slope
         return OutlineLines(distance, points, normal, gap)
 
-    def select(self, index: Bool[Tensor, " m"]) -> "OutlineLines":
+    def select(self, index: Bool[Tensor, " m"] | Int[Tensor, " k"]) -> "OutlineLines":
         """The lines at `index`."""
         return OutlineLines(self.distance[index], self.points[index], self.normal[index], self.gap[index])
 
@@ -141,62 +143,75 @@ def _towards_surface(field: Field, points: Float[Tensor, "m 3"]) -> Float[Tensor
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """An image of n flattened rays.
+    """The cells of n flattened rays: the pixels of an image, or the squares of its pixels.
 
     Args:
-        steps: from a ray to the next one, to the right and down, of origins and directions.
+        centres: the rays through the centres of the cells.
+        centred: whether these are the rays themselves.
+        steps: from a centre to the next one, to the right and down, of origins and directions.
         pairs: the indices of two neighbours, in both orders.
     """
 
+    centres: Rays
+    centred: bool
     steps: Float[Tensor, "2 2 n 3"]
     pairs: Int[Tensor, "2 p"]
 
     @staticmethod
     def of(rays: Rays) -> "PixelGrid | None":
-        """The grid of an image; None for other rays, and for an image with a single row or column."""
-        if not rays.image or min(rays.shape[-2:]) < 2 or not rays.shape.numel():
+        """The grid of an image or of `Rays.cells`; None for other rays, and for a single row or column."""
+        image = rays if rays.image else rays.cells
+        if image is None or min(image.shape[-2:]) < 2 or not image.shape.numel():
             return None
-        vectors = [tensor.detach() for tensor in (rays.origins, rays.directions)]
-        steps = [_step(tensor, dim).reshape(-1, 3) for dim in (-2, -3) for tensor in vectors]
-        index = torch.arange(rays.shape.numel(), device=rays.origins.device).view(rays.shape)
+        index = torch.arange(image.shape.numel(), device=rays.origins.device)
+        if rays.image:
+            index = index.view(rays.shape)
+        else:  # from [height, width, column, row] in a pixel
+            side = isqrt(rays.shape[-1])
+            index = index.view(*rays.shape[:2], side, side).permute(0, 3, 1, 2).reshape(image.shape)
+        order = index.flatten().argsort()
+        vectors = [tensor.detach() for tensor in (image.origins, image.directions)]
+        steps = [_step(tensor, dim).reshape(-1, 3)[order] for dim in (-2, -3) for tensor in vectors]
         first = torch.cat([index[..., 1:].flatten(), index[..., 1:, :].flatten()])
         second = torch.cat([index[..., :-1].flatten(), index[..., :-1, :].flatten()])
         pairs = torch.stack([torch.cat([first, second]), torch.cat([second, first])])
-        return PixelGrid(torch.stack(steps).unflatten(0, (2, 2)), pairs)
+        return PixelGrid(image.flat()[order], rays.image, torch.stack(steps).unflatten(0, (2, 2)), pairs)
 
-    def widths(self, distance: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """The longer side of each pixel at a distance along its ray, in scene units."""
-        return torch.linalg.vector_norm(self.steps[:, 0] + distance[:, None] * self.steps[:, 1], dim=-1).amax(dim=0)
+    def reach(self, distance: Float[Tensor, " n"]) -> Float[Tensor, ""]:
+        """How far from a ray the outline can be that its line splits, at a distance along it, in scene units.
 
-    def spacing(
-        self, ray: Int[Tensor, " m"], distance: Float[Tensor, " m"], normal: Float[Tensor, "m 3"]
-    ) -> Float[Tensor, " m"]:
-        """By how much the distance from a line changes to the next ray, in the image's row or column that it crosses.
-
-        Of all rays in that row or column, exactly one is within half of it from the line.
+        This is a cell's longer side, or twice that if the ray is anywhere in its cell: a line also splits neighbours.
         """
-        steps = self.steps[:, 0, ray] + distance[:, None] * self.steps[:, 1, ray]
-        return (steps * normal).sum(-1).abs().amax(dim=0)
+        widths = torch.linalg.vector_norm(self.steps[:, 0] + distance[:, None] * self.steps[:, 1], dim=-1)
+        return (1 if self.centred else 2) * widths.max()
+
+    def covered_share(self, ray: Int[Tensor, " m"], lines: OutlineLines) -> Float[Tensor, " m"]:
+        """The share of each ray's cell inside of its line, from 0 to 1.
+
+        Of all cells in an image's row or column that the line crosses, exactly one has its centre within half of the
+        step to the next centre.
+        """
+        steps = self.steps[:, 0, ray] + lines.distance[:, None] * self.steps[:, 1, ray]
+        spacing = (steps * lines.normal).sum(-1).abs().amax(dim=0)
+        to_centre = self.centres[ray].at(lines.distance) - lines.points
+        return (0.5 - (lines.gap + (lines.normal * to_centre).sum(-1)) / spacing).clamp(0, 1)
 
     def hits_beside(
         self,
         lines: OutlineLines,
         near: Int[Tensor, " m"],
-        rays: Rays,
         is_candidate: Bool[Tensor, " n"],
     ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, " k"]]:
-        """Candidates whose pixel is split by the line of a neighbour, the nearest one: line, ray, and covered share."""
+        """Candidates whose cell is split by the line of a neighbour, the nearest one: line, ray, and covered share."""
         row = torch.full_like(is_candidate, -1, dtype=near.dtype).index_put(
             (near,), torch.arange(len(near), device=near.device, dtype=near.dtype)
         )
         inside, outside = self.pairs
         used = is_candidate[inside] & (row[outside] >= 0)
         ray, line = inside[used], row[outside[used]]
-        distance = lines.distance[line]
-        gap = lines.gap[line] + (lines.normal[line] * (rays[ray].at(distance) - lines.points[line])).sum(-1)
-        weight = 0.5 - gap / self.spacing(near[line], distance, lines.normal[line])
+        weight = self.covered_share(ray, lines.select(line))
         order = weight.detach().argsort(stable=True)
-        order = order[(weight.detach()[order] > 0.5) & (weight.detach()[order] < 1)]
+        order = order[(weight.detach()[order] > (0.5 if self.centred else 0)) & (weight.detach()[order] < 1)]
         rank = torch.arange(len(order), device=order.device)
         first = torch.full_like(row, len(order)).scatter_reduce(0, ray[order], rank, "amin")
         chosen = order[first[first < len(order)]]

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from bench.config import load
+from bench.solve import pixel_area
 from renderers.camera import Rays
 from renderers.field import Kind, Meter
 from renderers.fields.analytic import Shape, box, plane, sphere
@@ -75,6 +76,27 @@ def test_an_image_of_a_camera_has_the_derivative_of_its_covered_pixels():
     expected = (true_area(RADIUS + 1e-3) - true_area(RADIUS - 1e-3)) / 2e-3
     assert opacity.item() == pytest.approx(true_area(RADIUS), rel=0.01)
     assert torch.autograd.grad(opacity, radius)[0].item() == pytest.approx(expected, rel=0.1)
+
+
+@each("count", [4, 16])
+def test_several_rays_per_pixel_split_their_squares(count):
+    """Wherever a ray is in its square, with a tenth of the noise of a band."""
+    truth = (true_area(RADIUS + 1e-3) - true_area(RADIUS - 1e-3)) / 2e-3
+
+    def drawn(renderer) -> Tensor:
+        radius, results = torch.tensor(RADIUS, requires_grad=True), []
+        for iteration in range(8):
+            opacity = (
+                renderer.render(sphere(radius), pixel_area.random_rays(CAMERA, count, iteration, 0)).opacity.sum()
+                / count
+            )
+            results.append(torch.stack([opacity.detach() / true_area(RADIUS), *torch.autograd.grad(opacity, radius)]))
+        return torch.stack(results)
+
+    edges = drawn(EDGES)
+    assert (edges[:, 0] - 1).abs().max() < 0.005
+    assert edges[:, 1].mean().item() == pytest.approx(truth, rel=0.03)
+    assert drawn(BAND)[:, 1].std() > 5 * edges[:, 1].std() > 0
 
 
 def test_the_surface_behind_an_outline_has_the_rest_of_a_split_pixel():
