@@ -26,10 +26,10 @@ NOT_LOSS_TERMS = (
     *("iteration", "seconds", "value_evaluations", "gradient_evaluations", "cost"),
     *("chamfer_l1", "chamfer_l2", "psnr", "seen_chamfer_l1", "rotation_error_deg", "translation_error", "success"),
 )
-PAGE_FOLDERS = ("page", "base", "parts", "views", "data", "list", "run", "mesh")
+PAGE_FOLDERS = ("page", "base", "parts", "views", "data", "list", "run", "mesh", "shipped")
 SUBFOLDERS = ("runs", "sweeps", "earlier", "paper", "suite", ".locks", *PAGE_FOLDERS)
 # The files and folders of a results folder that this project writes.
-WRITABLE_PATTERNS = ("*", "paper/*", "suite/*", "suite/*/*", "sweeps/*/*", "page/*", "page/data/*")
+WRITABLE_PATTERNS = ("*", "paper/*", "suite/*", "suite/*/*", "sweeps/*/*", "page/*", "page/data/*", "page/shipped/*")
 
 
 @dataclass(frozen=True)

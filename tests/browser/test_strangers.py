@@ -194,7 +194,7 @@ def test_an_address_leads_into_the_folder_or_nowhere(tmp_path, tab):
     made.write(tmp_path, 0)
     write_index(tmp_path)
     page = tab(tmp_path).open()
-    good = ["#/runs", "runs/a/summary.png", "paper/table1.csv", "data:image/webp;base64,AAAA"]
+    good = ["#/runs", "runs/a/summary.png", "paper/table1.csv", "page/shipped/fig5.png", "data:image/webp;base64,AAAA"]
     bad = [
         "javascript:1",
         "../a",
@@ -204,6 +204,7 @@ def test_an_address_leads_into_the_folder_or_nowhere(tmp_path, tab):
         "//a/runs/",
         "file:///etc/passwd",
         "/etc",
+        "page/data/a.js",
     ]
     bad += ["data:text/html;base64,AAAA", "data:image/svg+xml;base64,AAAA", "runs/a:b", " javascript:1", "runs/\\..\\a"]
     allowed = page.evaluate("all => all.map((each) => implicitBench.dom.safeAddress(each))", [*good, *bad])

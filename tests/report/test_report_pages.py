@@ -12,7 +12,7 @@ import bench.studies
 from bench.records.read import read_records
 from bench.report.data.records import Row, base_renderer, row_of
 from bench.report.data.runs import Selection, choose
-from bench.report.write import paper, table
+from bench.report.write import html, paper, table
 from bench.report.write.caption import SMOKE_WARNING
 from bench.report.write.paper import find_paper, papers, studies, write_paper
 from bench.report.write.result import Result, Shown, read_shown
@@ -158,6 +158,20 @@ def test_a_page_of_a_sweep_of_the_user_has_the_time_of_its_request(tmp_path, mon
     (own / "sweeps" / "other-2abc" / "table.json").write_text(Shown(title="T.").to_json())
     times = {entry["name"]: entry["asked"] for entry in papers(own)[0]}
     assert times == {"asked": 20, "old": 0, "theirs": 0, "other-2abc": 30}
+
+
+def test_shipped_pages_without_a_chart_have_a_copy_of_their_picture(tmp_path, monkeypatch):
+    own, shipped = tmp_path / "own", tmp_path / "shipped"
+    monkeypatch.setattr(paper, "SHIPPED", shipped)
+    own.mkdir()
+    (shipped / "paper").mkdir(parents=True)
+    for name, chart in (("drawn", None), ("charted", {"panels": []})):
+        (shipped / "paper" / f"{name}.json").write_text(Shown(title="T.", chart=chart).to_json())
+        (shipped / "paper" / f"{name}.png").write_bytes(name.encode())
+    html.write_index(own)
+    pictures = {page.name: page.picture for page in find_paper(own)}
+    assert pictures == {"drawn": "page/shipped/drawn.png", "charted": None}
+    assert [path.read_bytes() for path in (own / "page" / "shipped").iterdir()] == [b"drawn"]
 
 
 def test_every_study_can_be_read_and_has_pages_of_its_own():

@@ -23,10 +23,9 @@ from bench.report.site.columns import columns
 from bench.report.site.detail import detail
 from bench.report.site.files import Folder
 from bench.report.site.renderers import renderers
-from bench.report.write.paper import papers
+from bench.report.write.paper import PAGE_FOLDER, copied_pictures, papers
 
 ASSETS = Path(__file__).parents[1] / "page"
-PAGE_FOLDER = "page"
 SILENT_WAIT_SECONDS = 1.0
 LIBRARY = "plotly.min.js"
 MAX_MESHES = 100  # `bench.report meshes=all` makes all
@@ -77,6 +76,8 @@ def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: 
     folders = [Folder(results_dir, record["folder"]) for record in records]
     entries, content_by_key = papers(results_dir)
     _copy_assets(results_dir / PAGE_FOLDER)
+    for name, source in copied_pictures(results_dir):
+        write_file(results_dir / name, source.read_bytes())
     bundles = grouped(zip(folders, records, strict=True), lambda run: run[0].key[:KEY_PREFIX_LETTERS])
     details = (
         (name, {folder.key: detail(record, folder, results_dir) for folder, record in runs})

@@ -24,6 +24,7 @@ from bench.report.write.result import Result, Shown, as_markdown, latex, read_sh
 from bench.tables import CONF, nearest, read_yaml
 
 FOLDER = "paper"
+PAGE_FOLDER = "page"
 SWEEPS, TABLE = "sweeps", "table"  # the table of a sweep is next to its plan
 SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 ROOT = Path(__file__).resolve().parents[3]
@@ -160,7 +161,8 @@ def write_paper(
 class Page:
     """A table or figure of a results folder: its name, its content, its picture and its files by kind.
 
-    Paths of files are relative to the results folder and percent-encoded; `shipped` pages have none.
+    Paths of files are relative to the results folder and percent-encoded. Of `shipped` pages, only a picture that no
+    chart replaces has one, where the page has its copy.
     """
 
     name: str
@@ -177,7 +179,18 @@ def find_paper(results_dir: Path) -> list[Page]:
     own_names = {page.name for page in own_pages}
     others = [] if results_dir.resolve() == SHIPPED else _pages_of(SHIPPED)
     shipped = [page for page in others if page.name not in own_names]
-    return own_pages + [replace(page, picture=None, files={}, shipped=True) for page in shipped]
+    return own_pages + [replace(page, picture=_copied_picture(page), files={}, shipped=True) for page in shipped]
+
+
+def _copied_picture(page: Page) -> str | None:
+    has_chart = page.shown.chart or page.shown.atlas
+    return None if has_chart or page.picture is None else link(PAGE_FOLDER, "shipped", f"{page.name}.png")
+
+
+def copied_pictures(results_dir: Path) -> list[tuple[str, Path]]:
+    """The address of each picture of a shipped page in the results folder, and the file that it is a copy of."""
+    pages = [page for page in find_paper(results_dir) if page.shipped and page.picture]
+    return [(page.picture, page.base.with_suffix(".png")) for page in pages]
 
 
 def _pages_of(results_dir: Path) -> list[Page]:

@@ -4,7 +4,7 @@
   "use strict";
 
   const PICTURE = /^data:image\/(png|gif|webp|jpeg);base64,[A-Za-z0-9+/=]*$/;
-  const WITHIN = /^(runs|paper|sweeps)\/[A-Za-z0-9_.~%/-]*$/;
+  const WITHIN = /^(runs|paper|sweeps|page\/shipped)\/[A-Za-z0-9_.~%/-]*$/;
   const ATTRIBUTE =
     /^(aria-[a-z]+|data-[a-z]+|id|role|type|title|alt|loading|scope|colspan|width|height|tabindex|placeholder)$/;
 
