@@ -1,6 +1,7 @@
 """Cameras and rays. Axes: x right, y down, z forward (OpenCV); the centre of pixel (column, row) is at +0.5."""
 
 from dataclasses import dataclass
+from math import isqrt
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,8 +16,9 @@ class Rays:
     are neighbours in the view.
 
     Args:
-        cells: of rays [height, width, n], one in each of k x k = n squares of each pixel, column by column: an image
-            [height k, width k] through the centres of the squares, with the gradient of the rays. None for other rays.
+        cells: of rays [height, width, k * k] in pixels of k x k equal cells, column by column, with a ray anywhere in
+            each cell: the image [height * k, width * k] of rays through the cells' centres, with the same gradient.
+            `bench.solve.pixel_area.random_rays` makes both.
     """
 
     origins: Float[Tensor, "*rays 3"]
@@ -35,6 +37,15 @@ class Rays:
         length = torch.linalg.vector_norm(self.directions.detach(), dim=-1)
         if length.numel() and not bool(((length - 1).abs() < 1e-3).all()):
             raise ValueError("directions must have unit length: pass them through torch.nn.functional.normalize")
+        if self.cells is not None:
+            height, width, count = self.shape if len(self.shape) == 3 else (0, 0, 0)
+            side = isqrt(count)
+            shapes = count == side**2 > 0 and (*self.cells.shape,) == (height * side, width * side)
+            if self.image or not self.cells.image or not shapes:
+                raise ValueError(
+                    f"rays {list(self.shape)} cannot have cells {list(self.cells.shape)}: rays [height, width, k * k] "
+                    "that are no image have an image [height * k, width * k] as cells; else leave cells out"
+                )
 
     @property
     def shape(self) -> torch.Size:

@@ -15,7 +15,11 @@ SEED_OF_RAYS = 7  # added to seeds, so that the rays of pixels do not follow the
 
 
 def random_rays(camera: Camera, count: int, seed: int, iteration: int) -> Rays:
-    """The rays [height, width, count] of an iteration: a random one in each of `count` equal squares of each pixel."""
+    """The rays [height, width, count] of an iteration: a random one in each of `count` equal cells of each pixel.
+
+    Args:
+        count: a square number.
+    """
     side, shape = isqrt(count), (camera.height, camera.width, count, 2)
     corner = torch.cartesian_prod(torch.arange(side), torch.arange(side))
     inside = torch.rand(shape, generator=generator_of(seed + SEED_OF_RAYS, iteration))

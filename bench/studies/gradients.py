@@ -20,6 +20,10 @@ VISIBILITY_HEADINGS = {  # headings of the metrics of the image at the outline
     **dict(zip(IMAGE_METRICS, ("Cosine", "Scale"), strict=True)),
     **{"image_error": "Error", "image_spread": "Noise of a ray", "values_per_ray": "Evaluations per ray"},
 }
+EDGES_NOTE = (
+    "The silhouette's rays are no image, so edge sampling splits no pixels here. It has a band, like the relaxed "
+    "boundary, and nearly the same numbers. The page outline has it with whole images."
+)
 NOTES = (
     "A pooled number compares the gradients of all pixels of a band as one long vector. A factor that differs between "
     "pixels lowers the pooled cosine, but not the cosine of a single pixel.",
@@ -28,6 +32,7 @@ NOTES = (
     "Excluded: pixels where visibility changes, the root is not found again, or the renderer misses or hits another "
     "surface.",
     "Colour: the gradient of a smooth colour of point and normal, for shape (code), camera and colours (texture).",
+    EDGES_NOTE,
 )
 VISIBLE_NOTES = (
     "A pixel at the outline is the mean distance of many rays; a miss has the distance of the far side of the unit "
@@ -38,8 +43,7 @@ VISIBLE_NOTES = (
     "of the occupancy, relaxed boundary: the band). A pixel at the outline is about 0.01 scene units wide.",
     "A blur of a pixel or more moves the gradient to neighbouring pixels. This lowers the cosine and the scale of a "
     "pixel, but not the sum over the image.",
-    "These rays are no image, so edge sampling splits no pixels here. It has a band, as the relaxed boundary has, and "
-    "nearly the same numbers. The page outline has it with whole images.",
+    EDGES_NOTE,
     "For a disc, with default settings, the central difference has an error of 0.07 and a cosine of 0.997, because few "
     "rays of a pixel change sides.",
 )
@@ -120,7 +124,7 @@ def _visibility_verdict(data: pd.DataFrame) -> str:
     blurred, sharp = measured[measured["blur"].notna()], measured[measured["blur"].isna()]
     parts = []
     if len(blurred):
-        best = blurred.loc[blurred["image_cosine"].idxmax()]
+        best = blurred.loc[blurred["image_cosine"].round(2).idxmax()]  # the first of equal ones
         parts.append(
             f"{best['name']} has a cosine of *{best['image_cosine']:.2f}* and a scale of {best['image_scale']:.2f} at "
             f"a blur of {best['blur']:g} scene units"

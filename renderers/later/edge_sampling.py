@@ -29,12 +29,12 @@ class EdgeSampling(SurfaceRenderer):
     the ray. A ray that misses reaches it from its near miss, the first local minimum of the field within a pixel. A ray
     that hits takes the line of a neighbour that misses. A pixel is covered by 1/2 minus its centre's distance from the
     line over the pixel's width. The derivative of this distance is that of the edge point along its normal. With
-    several rays per pixel, each one's square (`Rays.cells`) is split as a pixel is, wherever the ray is in it.
+    several rays per pixel, the cell of each ray is split as a pixel is, wherever the ray is in it (`Rays.cells`).
 
     Source: IRON (Zhang et al. 2022, arXiv 2204.02232), Sec. 3.3: edge points, and pixels that they split.
-    Differentiable in: field parameters and rays. Hits by the implicit rule, exactly, up to `epsilon`. In images of rays
-        the derivative of a silhouette's area has no bias from a band, except where the outline bends, or two parts of
-        it lie, within a pixel.
+    Differentiable in: field parameters and rays. Hits by the implicit rule, exactly, up to `epsilon`. In images and
+        with cells, the derivative of a silhouette's area has no bias from a band, except where the outline bends, or
+        two parts of it lie, within a cell.
     Needs: a distance or a bound inside the sphere; near misses are searched within a pixel's width, in field units.
     Deviates from the paper: an edge point is projected from a near miss, not walked to along the surface; neighbours
         share it; the split does not depend on the outline's direction in the pixel; only the first surface within a
@@ -60,7 +60,7 @@ class EdgeSampling(SurfaceRenderer):
 
     @property
     def blur(self) -> float:
-        """The width, in scene units if the field is a distance; images have no blur, except their pixels."""
+        """The width, in scene units if the field is a distance; images and cells have no blur, except the cells."""
         return self.width
 
     def with_blur(self, blur: float) -> "EdgeSampling":
@@ -69,9 +69,9 @@ class EdgeSampling(SurfaceRenderer):
     def render(self, field: Field, rays: Rays) -> Rendering:
         """Marches without a graph, then attaches the gradients of hits and of edge points."""
         check_kind(self, field)
-        flat, pixels = rays.flat(), PixelGrid.of(rays)
+        flat, cells = rays.flat(), CellGrid.of(rays)
         with torch.no_grad():
-            band = self.width if pixels is None else pixels.reach(sphere_span(flat, self.sphere_radius)[1])
+            band = self.width if cells is None else cells.reach(sphere_span(flat, self.sphere_radius)[1])
             front, near_distance, near_value = march_past_near_misses(self, field, flat, band)
         rendering = implicit_rendering(field, rays, front, least_slope=self.least_slope, radius=self.sphere_radius)
         near = near_value.isfinite().nonzero().squeeze(-1)
@@ -80,17 +80,17 @@ class EdgeSampling(SurfaceRenderer):
         near, lines = near[is_valid], lines.select(is_valid)
         hit, distance = front.status == Status.HIT, rendering.distance.view(-1)
         hit_weight = torch.ones_like(distance)
-        if pixels is None:
+        if cells is None:
             band_gap = self.width * lines.gap.detach() / near_value[near]  # the width in scene units
             weight, split = (lines.gap.detach() - lines.gap) / band_gap, torch.ones_like(near).bool()
         else:
-            weight = pixels.covered_share(near, lines)
+            weight = cells.covered_share(near, lines)
             split = weight.detach() > 0
         outer, outer_weight = near[split], weight[split]
         hit_weight = hit_weight.index_put((outer,), 1 - outer_weight)
         samples = [(outer, lines.distance[split], outer_weight)]
-        if pixels is not None:
-            line, inner, inner_weight = pixels.hits_beside(lines, near, hit & (hit_weight == 1))
+        if cells is not None:
+            line, inner, inner_weight = cells.hits_beside(lines, near, hit & (hit_weight == 1))
             hit_weight = hit_weight.index_put((inner,), inner_weight)
             has_behind = hit[near[line]]
             behind = distance[near[line[has_behind]]]
@@ -142,23 +142,23 @@ def _towards_surface(field: Field, points: Float[Tensor, "m 3"]) -> Float[Tensor
 
 
 @dataclass(frozen=True)
-class PixelGrid:
-    """The cells of n flattened rays: the pixels of an image, or the squares of its pixels.
+class CellGrid:
+    """The cells of n flattened rays: the pixels of an image, or the parts of its pixels in `Rays.cells`.
 
     Args:
         centres: the rays through the centres of the cells.
-        centred: whether these are the rays themselves.
+        through_centres: whether these are the rays themselves.
         steps: from a centre to the next one, to the right and down, of origins and directions.
         pairs: the indices of two neighbours, in both orders.
     """
 
     centres: Rays
-    centred: bool
+    through_centres: bool
     steps: Float[Tensor, "2 2 n 3"]
     pairs: Int[Tensor, "2 p"]
 
     @staticmethod
-    def of(rays: Rays) -> "PixelGrid | None":
+    def of(rays: Rays) -> "CellGrid | None":
         """The grid of an image or of `Rays.cells`; None for other rays, and for a single row or column."""
         image = rays if rays.image else rays.cells
         if image is None or min(image.shape[-2:]) < 2 or not image.shape.numel():
@@ -174,16 +174,19 @@ class PixelGrid:
         steps = [_step(tensor, dim).reshape(-1, 3)[order] for dim in (-2, -3) for tensor in vectors]
         first = torch.cat([index[..., 1:].flatten(), index[..., 1:, :].flatten()])
         second = torch.cat([index[..., :-1].flatten(), index[..., :-1, :].flatten()])
+        if not rays.image:  # a line may cross a cell and yet leave the rays of its four neighbours on one side
+            first = torch.cat([first, index[..., 1:, 1:].flatten(), index[..., 1:, :-1].flatten()])
+            second = torch.cat([second, index[..., :-1, :-1].flatten(), index[..., :-1, 1:].flatten()])
         pairs = torch.stack([torch.cat([first, second]), torch.cat([second, first])])
-        return PixelGrid(image.flat()[order], rays.image, torch.stack(steps).unflatten(0, (2, 2)), pairs)
+        return CellGrid(image.flat()[order], rays.image, torch.stack(steps).unflatten(0, (2, 2)), pairs)
 
     def reach(self, distance: Float[Tensor, " n"]) -> Float[Tensor, ""]:
-        """How far from a ray the outline can be that its line splits, at a distance along it, in scene units.
+        """The largest distance from a ray to an outline that can split its cell or a neighbour's, in scene units.
 
-        This is a cell's longer side, or twice that if the ray is anywhere in its cell: a line also splits neighbours.
+        It is a cell's longer side, at a distance along the ray, or twice that if the ray is anywhere in its cell.
         """
         widths = torch.linalg.vector_norm(self.steps[:, 0] + distance[:, None] * self.steps[:, 1], dim=-1)
-        return (1 if self.centred else 2) * widths.max()
+        return (1 if self.through_centres else 2) * widths.max()
 
     def covered_share(self, ray: Int[Tensor, " m"], lines: OutlineLines) -> Float[Tensor, " m"]:
         """The share of each ray's cell inside of its line, from 0 to 1.
@@ -211,7 +214,7 @@ class PixelGrid:
         ray, line = inside[used], row[outside[used]]
         weight = self.covered_share(ray, lines.select(line))
         order = weight.detach().argsort(stable=True)
-        order = order[(weight.detach()[order] > (0.5 if self.centred else 0)) & (weight.detach()[order] < 1)]
+        order = order[(weight.detach()[order] > (0.5 if self.through_centres else 0)) & (weight.detach()[order] < 1)]
         rank = torch.arange(len(order), device=order.device)
         first = torch.full_like(row, len(order)).scatter_reduce(0, ray[order], rank, "amin")
         chosen = order[first[first < len(order)]]

@@ -130,7 +130,8 @@ class NearMissTracker:
         """Evaluates the field at local minima of the stored samples; the first one within the band is a near miss."""
         band, epsilon, values = self.band, self.epsilon, self.samples[:, 1]
         before, middle, after = values[:-2], values[1:-1], values[2:]
-        minima = (middle < before) & (middle < after) & (middle > 0) & (middle < CANDIDATE_FACTOR * band)
+        # Rounding makes neighbours at a minimum equal: of these, the last one counts.
+        minima = (middle <= before) & (middle < after) & (middle > 0) & (middle < CANDIDATE_FACTOR * band)
         step, ray = (minima & self.value.isinf()).nonzero(as_tuple=True)
         if len(ray):
             samples = torch.stack([self.samples[step + later, :, ray] for later in range(3)])

@@ -139,7 +139,7 @@ def test_shipped_rows_stand_below_ones_own_where_the_columns_are_alike(tmp_path,
         for name, last in (("alike", "Error"), ("other", f"Error of {row}")):
             shown = Shown(title="T.", columns=["Row", last], rows=[[row, "1"]])
             (folder / f"{name}.json").write_text(shown.to_json())
-    entries, wholes = papers(own.parent)
+    entries, wholes, _ = papers(own.parent)
     rows = {entry["name"]: wholes[entry["key"]]["rows"] for entry in entries}
     assert rows == {"alike": [["mine", "1"], ["shipped: ours", "1"]], "other": [["mine", "1"]]}
 
@@ -168,6 +168,8 @@ def test_shipped_pages_without_a_chart_have_a_copy_of_their_picture(tmp_path, mo
     for name, chart in (("drawn", None), ("charted", {"panels": []})):
         (shipped / "paper" / f"{name}.json").write_text(Shown(title="T.", chart=chart).to_json())
         (shipped / "paper" / f"{name}.png").write_bytes(name.encode())
+    (own / "page" / "shipped").mkdir(parents=True)
+    (own / "page" / "shipped" / "former.png").write_bytes(b"")
     html.write_index(own)
     pictures = {page.name: page.picture for page in find_paper(own)}
     assert pictures == {"drawn": "page/shipped/drawn.png", "charted": None}

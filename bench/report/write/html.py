@@ -23,7 +23,7 @@ from bench.report.site.columns import columns
 from bench.report.site.detail import detail
 from bench.report.site.files import Folder
 from bench.report.site.renderers import renderers
-from bench.report.write.paper import PAGE_FOLDER, copied_pictures, papers
+from bench.report.write.paper import COPIES, PAGE_FOLDER, papers
 
 ASSETS = Path(__file__).parents[1] / "page"
 SILENT_WAIT_SECONDS = 1.0
@@ -74,10 +74,9 @@ def write_page(records: list[dict[str, Any]], problems: list[str], results_dir: 
     """Writes and returns the page of records that were read within `page_lock`, see `write_index`."""
     data, page = results_dir / PAGE_FOLDER / "data", results_dir / "index.html"
     folders = [Folder(results_dir, record["folder"]) for record in records]
-    entries, content_by_key = papers(results_dir)
+    entries, content_by_key, copied = papers(results_dir)
     _copy_assets(results_dir / PAGE_FOLDER)
-    for name, source in copied_pictures(results_dir):
-        write_file(results_dir / name, source.read_bytes())
+    _copy_pictures(results_dir.joinpath(*COPIES), copied)
     bundles = grouped(zip(folders, records, strict=True), lambda run: run[0].key[:KEY_PREFIX_LETTERS])
     details = (
         (name, {folder.key: detail(record, folder, results_dir) for folder, record in runs})
@@ -146,6 +145,17 @@ def _copy_assets(folder: Path) -> None:
     for path in (*ASSETS.rglob("*.css"), *ASSETS.rglob("*.js")):
         write_file(folder / path.relative_to(ASSETS), path.read_bytes())
     write_file(folder / LIBRARY, (Path(find_spec("plotly").origin).parent / "package_data" / LIBRARY).read_bytes())
+
+
+def _copy_pictures(folder: Path, sources: Iterable[Path]) -> None:
+    """Copies pictures into a folder, and removes the others."""
+    names = set()
+    for source in sources:
+        write_file(folder / source.name, source.read_bytes())
+        names.add(source.name)
+    for path in folder.glob("*.png"):
+        if path.name not in names:
+            path.unlink()
 
 
 def to_script(kind: str, key: str, data: Any) -> str:

@@ -25,6 +25,7 @@ from bench.tables import CONF, nearest, read_yaml
 
 FOLDER = "paper"
 PAGE_FOLDER = "page"
+COPIES = (PAGE_FOLDER, "shipped")  # folder of the pictures of shipped pages
 SWEEPS, TABLE = "sweeps", "table"  # the table of a sweep is next to its plan
 SUFFIXES = (".pdf", ".csv", ".md", ".tex")
 ROOT = Path(__file__).resolve().parents[3]
@@ -161,8 +162,8 @@ def write_paper(
 class Page:
     """A table or figure of a results folder: its name, its content, its picture and its files by kind.
 
-    Paths of files are relative to the results folder and percent-encoded. Of `shipped` pages, only a picture that no
-    chart replaces has one, where the page has its copy.
+    Paths of files are relative to the results folder and percent-encoded. A shipped page has no files. Its picture is
+    the copy in `page/shipped`, if it has no chart.
     """
 
     name: str
@@ -184,13 +185,7 @@ def find_paper(results_dir: Path) -> list[Page]:
 
 def _copied_picture(page: Page) -> str | None:
     has_chart = page.shown.chart or page.shown.atlas
-    return None if has_chart or page.picture is None else link(PAGE_FOLDER, "shipped", f"{page.name}.png")
-
-
-def copied_pictures(results_dir: Path) -> list[tuple[str, Path]]:
-    """The address of each picture of a shipped page in the results folder, and the file that it is a copy of."""
-    pages = [page for page in find_paper(results_dir) if page.shipped and page.picture]
-    return [(page.picture, page.base.with_suffix(".png")) for page in pages]
+    return None if has_chart or page.picture is None else link(*COPIES, f"{page.name}.png")
 
 
 def _pages_of(results_dir: Path) -> list[Page]:
@@ -206,12 +201,13 @@ def find_sweeps(results_dir: Path) -> list[Page]:
     return [replace(page_at(folder / TABLE, results_dir), name=folder.name) for folder in folders]
 
 
-def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
-    """The list entry of each page, sweeps last; and the full content of each page by key."""
-    entries, content_by_key = [], {}
+def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]], list[Path]]:
+    """The list entry of each page, sweeps last; the full content of each page by key; the pictures to be copied."""
+    entries, content_by_key, copied = [], {}, []
     for page in [*find_paper(results_dir), *find_sweeps(results_dir)]:
         key = key_of(page.name)
         shown = page.shown
+        copied += [page.base.with_suffix(".png")] if page.shipped and page.picture else []
         texts = {"question": shown.question, "verdict": shown.verdict, "shipped": page.shipped}
         sweeps = [] if page.shipped else _sweep_folders(page, results_dir)
         texts["asked"] = max(map(_plan_time, sweeps), default=0.0)
@@ -222,7 +218,7 @@ def papers(results_dir: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str,
             **{"command": shown.command, "folders": shown.folders, "best": shown.best},
             **{"chart": shown.chart, "atlas": shown.atlas},
         }
-    return entries, content_by_key
+    return entries, content_by_key, copied
 
 
 def _sweep_folders(page: Page, results_dir: Path) -> list[Path]:

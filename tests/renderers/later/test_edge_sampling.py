@@ -78,25 +78,32 @@ def test_an_image_of_a_camera_has_the_derivative_of_its_covered_pixels():
     assert torch.autograd.grad(opacity, radius)[0].item() == pytest.approx(expected, rel=0.1)
 
 
-@each("count", [4, 16])
-def test_several_rays_per_pixel_split_their_squares(count):
-    """Wherever a ray is in its square, with a tenth of the noise of a band."""
+def derivatives_of_area(renderer, count: int, draws: int = 8) -> Tensor:
+    """The area of a sphere over the true one, and its derivative over the true one, by draws of random rays."""
     truth = (true_area(RADIUS + 1e-3) - true_area(RADIUS - 1e-3)) / 2e-3
+    radius, results = torch.tensor(RADIUS, requires_grad=True), []
+    for draw in range(draws):
+        rays = pixel_area.random_rays(CAMERA, count, draw, 0)
+        opacity = renderer.render(sphere(radius), rays).opacity.sum() / count
+        (rate,) = torch.autograd.grad(opacity, radius)
+        results.append(torch.stack([opacity.detach() / true_area(RADIUS), rate / truth]))
+    return torch.stack(results)
 
-    def drawn(renderer) -> Tensor:
-        radius, results = torch.tensor(RADIUS, requires_grad=True), []
-        for iteration in range(8):
-            opacity = (
-                renderer.render(sphere(radius), pixel_area.random_rays(CAMERA, count, iteration, 0)).opacity.sum()
-                / count
-            )
-            results.append(torch.stack([opacity.detach() / true_area(RADIUS), *torch.autograd.grad(opacity, radius)]))
-        return torch.stack(results)
 
-    edges = drawn(EDGES)
+@each("count, error", [(4, 0.03), (16, 0.01)])
+def test_several_rays_per_pixel_split_their_cells(count, error):
+    """Wherever a ray is in its cell, with less than a fifth of the noise of a band."""
+    edges = derivatives_of_area(EDGES, count)
     assert (edges[:, 0] - 1).abs().max() < 0.005
-    assert edges[:, 1].mean().item() == pytest.approx(truth, rel=0.03)
-    assert drawn(BAND)[:, 1].std() > 5 * edges[:, 1].std() > 0
+    assert edges[:, 1].mean().item() == pytest.approx(1, rel=error)
+    assert derivatives_of_area(BAND, count)[:, 1].std() > 5 * edges[:, 1].std() > 0
+
+
+@each("count", [2, 16])
+def test_cells_of_other_rays_are_refused(count):
+    rays = CAMERA.rays(torch.zeros(24, 24, count, 2))
+    with pytest.raises(ValueError, match="leave cells out"):
+        replace(rays, cells=CAMERA.resized(48, 48).rays())
 
 
 def test_the_surface_behind_an_outline_has_the_rest_of_a_split_pixel():
