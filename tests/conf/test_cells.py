@@ -33,7 +33,7 @@ COMPARING = {
     "table1": 25,
     "fig4": 7,
     "fig5": 9,
-    "stability": 23,
+    "stability": 22,
     "gradients": 17,
     "speed_accuracy": 32,
     "fit_for": 19,

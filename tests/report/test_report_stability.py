@@ -98,7 +98,7 @@ def test_the_shipped_heat_map_has_a_line_per_renderer_and_marks_what_breaks_at_o
     cells = breakdowns.cells_of(choose(rows, READS[0], SHIPPED))
     figure = next(study for study in studies() if "stability" in study.pages).results(rows, SHIPPED)["stability"].figure
     panels = figure.axes[:2]
-    assert all(len(panel.get_yticklabels()) == 11 for panel in panels)
+    assert all(len(panel.get_yticklabels()) == 12 for panel in panels)
     assert sum(len(panel.get_xticklabels()) for panel in panels) == cells["axis"].nunique()
     shown = {label.get_text() for label in panels[0].get_yticklabels()}
     crosses = [text for panel in panels for text in panel.texts if text.get_text() == "×"]
