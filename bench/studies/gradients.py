@@ -32,6 +32,7 @@ NOTES = (
     "Excluded: pixels where visibility changes, the root is not found again, or the renderer misses or hits another "
     "surface.",
     "Colour: the gradient of a smooth colour of point and normal, for shape (code), camera and colours (texture).",
+    "The silhouette is at each renderer's default blur; the page gradients_visibility has equal blurs.",
     EDGES_NOTE,
 )
 VISIBLE_NOTES = (
@@ -114,7 +115,9 @@ def _verdict(data: pd.DataFrame) -> str:
     cosines = hits["code_pooled_cosine"].where(hits["status"] == "ok").groupby(hits["name"], sort=False)
     least = cosines.min(min_count=len(ANGLES))  # NaN if a band is missing
     reached = f"{(least >= 0.99).sum()} of {len(least)}"
-    title = f"{reached} reach a pooled cosine of 0.99 in all bands of hits, for the code. Lowest band"
+    names = "; ".join(map(str, least.index[least >= 0.99]))
+    which = f"the code: {names}" if names else "the code"
+    title = f"{reached} reach a pooled cosine of 0.99 in all bands of hits, for {which}. Lowest band"
     return table.extremes(title, least.to_dict(), "one shape", show=_cosine, largest_first=True)
 
 

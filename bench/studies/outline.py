@@ -20,6 +20,7 @@ NOTES = (
     "With 1 ray, it goes through the centre of each pixel. With 4 and 16, each iteration draws a random ray in each of "
     "2 x 2 or 4 x 4 squares of the pixel. Edge sampling splits these squares, as it splits pixels with 1 ray. All rows "
     "have 60 iterations, whatever their rays cost.",
+    "Rows may have fewer shapes with 16 rays. Compare their ratios then, not their medians.",
     "A run that is not ok counts with its result, if it has one. With `not_reached`, its loss did not fall.",
     "With 1 ray, a pixel's observation is its mask at the centre. With several, it is the covered fraction. Rows with "
     "mask or fraction in their name keep that observation for any number of rays. The figure leaves them out.",

@@ -301,12 +301,12 @@ def _hardest_axis(cells: pd.DataFrame) -> str:
     if shares.empty or not shares.iloc[0] > 0:
         return ""
     hardest = [str(axis) for axis in shares.index[shares == shares.iloc[0]]]
-    broken = "; ".join(
-        f"{breakdowns.title(axis)} (*{counts.loc[axis, 'sum']} of {counts.loc[axis, 'size']}* renderers break)"
-        for axis in hardest
+    broken = " and ".join(
+        f"{breakdowns.title(axis)} (*{counts.loc[axis, 'sum']} of {counts.loc[axis, 'size']}*)" for axis in hardest
     )
-    among = f"Of {len(shares)} axes, t" if len(shares) > 1 else "T"
-    return f"{among}he hardest at the mildest severity: {broken}."
+    among = f", of {len(shares)} axes" if len(shares) > 1 else ""
+    where = f"At the mildest severity, most renderers break on {broken}{among}"
+    return f"{where}. The table has what breaks each one first."
 
 
 PAGES = {"stability": make}

@@ -29,7 +29,7 @@ COST_NOTES = (
     "renderer that refuses the field.",
     "Intervals are 95 % bootstrap intervals over axes. Two renderers cannot be distinguished if the interval of the "
     "difference of their ranks contains 0. Each renderer has one preset; the page “stability_axes” has all presets.",
-    "At once: axes on which it breaks at the mildest severity. None: axes on which it does not break at the severest.",
+    "A renderer survives an axis if it does not break at the severest severity.",
 )
 CURVE_NOTES = (
     "The CSV has the trials and successes at each severity. If repeats can differ, it also has the interval of the "
@@ -39,7 +39,7 @@ CURVE_NOTES = (
 SHARE_COLUMNS = ("level", "severity", "successes", "trials", "share", "low", "high")
 COST_COLUMNS = (
     *(table.text("row", "Renderer"), table.Column("axes"), *table.estimate("rank", "Mean rank")),
-    *table.columns(table.word, at_once="At once", never="None"),
+    *table.columns(table.word, at_once="Axes broken at the mildest", never="Axes survived"),
     *(table.Column("cost", "Field evaluations per ray"), table.PRESET),
 )
 
