@@ -15,9 +15,8 @@ PLACE = 160
 READS = (
     Selection(
         "parsimony",
-        conditions=("view.resolution",),
+        conditions=("view.resolution", "task.rounds", "task.held_out_rays"),
         setup=("scenes", "pixels", "machine"),
-        alike=("models", "task"),
     ),
 )
 COSTS = ("seconds", "flops", "evaluations")
@@ -39,6 +38,7 @@ NOTES = (
     "A field that was checked on further views is chosen only if it suffices on {held:.0f} % or more of random draws "
     "of these. Unchecked: the run has no such draws of this field.",
     "Numbers are those that a field stores. Of a grid, only those near the surface are trained: `free` in the CSV.",
+    "Scenes may differ in their candidates, whose number is in the last column, and in the length of rounds.",
     "The field with the fewest numbers under half a pixel, confirmed or not, is fitted again at pixel precision: with "
     "renderer.epsilon=auto, renderer.steps=auto and rays that follow the loss. The table has the evaluations relative "
     "to its first fit, and the error. An exclamation mark: above half a pixel.",
@@ -130,10 +130,12 @@ def _verdict(lines: list[Line]) -> str:
     best = [line["candidates"].best for line in lines]
     same = sum(a is not None and a is b is c for a, b, c in zip(fewest, quickest, best, strict=True))
     sample = "scenes" if len({line["scene"] for line in lines}) == len(lines) else "scenes and resolutions"
+    unchecked = sum(result is not None and result.held(by_pixel=True) is None for result in quickest)
+    limit = f" (not checked on further views: {unchecked})" if unchecked else ""
     return (
-        f"The choice is a front: one field has the fewest numbers, the fewest FLOPs and the least error in *{same} of "
-        f"{len(lines)}* {sample}. Fewest numbers under half a pixel: {_kinds(fewest)}. Fewest FLOPs: "
-        f"{_kinds(quickest)}. Least error: {_kinds(best)}."
+        f"In *{same} of {len(lines)}* {sample}, a single field has the fewest numbers, the fewest FLOPs and the least "
+        f"error. Fewest numbers under half a pixel: {_kinds(fewest)}. Fewest FLOPs: {_kinds(quickest)}{limit}. Least "
+        f"error: {_kinds(best)}."
     )
 
 

@@ -63,7 +63,7 @@ def test_a_row_a_scene_the_least_need_first_and_a_failed_run_last(page):
     lost = page.data[page.data["scene"] == "torus 0"]
     assert (lost["status"].item(), lost["reason"].item()) == ("crashed", "why")
     assert "1 of 4 runs did not end ok: dist, 64 resolution, torus: crashed (why)." in told(page)
-    assert page.verdict.startswith("The choice is a front: one field has") and "*2 of 3* scenes" in page.verdict
+    assert page.verdict.startswith("In *2 of 3* scenes, a single field has")
 
 
 def test_a_row_has_a_choice_by_each_quantity(page):
