@@ -33,9 +33,10 @@ class RelaxedBoundary(SurfaceRenderer):
     Differentiable in: field parameters and rays. Hits by the implicit rule, exactly, up to `epsilon`. The visibility
         gradient comes from the band: a narrower band has less bias and more variance.
     Needs: a distance or a bound inside the sphere; the band's width is in field units.
-    Deviates from the paper: the minimum is evaluated at the vertex of the parabola through three marched samples; only
-        the first surface within the band counts; the band begins at `epsilon`, where hits end; the mask loss is IDR's,
-        since a mask of one ray per pixel gives no gradient to rays inside the outline.
+    Deviates from the paper: the minimum is evaluated at the vertex of the parabola through three marched samples, where
+        its value is up to a tenth too large next to sharp edges; only the first surface within the band counts; the
+        band begins at `epsilon`, where hits end; the mask loss is IDR's, since a mask of one ray per pixel gives no
+        gradient to rays inside the outline.
 
     Args:
         steps: maximum marching steps per ray.
