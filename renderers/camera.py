@@ -38,14 +38,23 @@ class Rays:
         if length.numel() and not bool(((length - 1).abs() < 1e-3).all()):
             raise ValueError("directions must have unit length: pass them through torch.nn.functional.normalize")
         if self.cells is not None:
-            height, width, count = self.shape if len(self.shape) == 3 else (0, 0, 0)
-            side = isqrt(count)
-            shapes = count == side**2 > 0 and (*self.cells.shape,) == (height * side, width * side)
-            if self.image or not self.cells.image or not shapes:
-                raise ValueError(
-                    f"rays {list(self.shape)} cannot have cells {list(self.cells.shape)}: rays [height, width, k * k] "
-                    "that are no image have an image [height * k, width * k] as cells; else leave cells out"
-                )
+            self._check_cells(self.cells)
+
+    def _check_cells(self, cells: "Rays") -> None:
+        height, width, count = self.shape if len(self.shape) == 3 else (0, 0, 0)
+        side = isqrt(count)
+        if self.image or not cells.image:
+            raise ValueError("only rays that are no image have cells, and the cells are an image: set image=")
+        if count != side**2 or (*cells.shape,) != (height * side, width * side):
+            raise ValueError(
+                f"rays {list(self.shape)} cannot have cells {list(cells.shape)}: rays [height, width, k * k] have "
+                "cells [height * k, width * k], without a batch; leave cells out"
+            )
+        if cells.origins.dtype != self.origins.dtype or cells.origins.device != self.origins.device:
+            raise ValueError(
+                f"rays in {self.origins.dtype} on {self.origins.device} cannot have cells in {cells.origins.dtype} on "
+                f"{cells.origins.device}: make both from one camera"
+            )
 
     @property
     def shape(self) -> torch.Size:

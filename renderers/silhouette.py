@@ -186,7 +186,8 @@ class Area:
         if rendering.volume is None:
             name = type(renderer).__name__
             raise Unsupported(
-                f"{name} has no opacity with a gradient, which silhouette=area needs: take silhouette=own, or neus"
+                f"{name} has no opacity with a gradient, which silhouette=area needs: take silhouette=own, or "
+                "renderer=edge_sampling, relaxed_boundary, neus, opaque, volsdf or unisurf"
             )
         if observed.covered is None:
             return self.weight * (rendering.opacity - observed.mask.to(rays.origins.dtype)).square().mean()

@@ -1,5 +1,6 @@
 """A results folder: the runs to be made in it and their plan, its run folders, their curves, and its links."""
 
+import errno
 import json
 import os
 from contextlib import suppress
@@ -153,3 +154,12 @@ def _parse_line(text: str) -> dict[str, Any]:
     except (ValueError, RecursionError):
         return {}
     return value if isinstance(value, dict) else {}
+
+
+def write_error_message(error: OSError, results_dir: str | None = None) -> str:
+    """A message on a file that cannot be written, and what to do; names `results_dir` if the error names no file."""
+    path = Path(named) if (named := error.filename or results_dir) else None
+    file = next((parent for parent in path.parents if parent.is_file()), path) if path else None
+    suffix = f" ({file})" if file else ""
+    remedy = "on a local disk, which has locks" if error.errno == errno.ENOLCK else "you can write, or free space"
+    return f"{error.strerror or error}{suffix}: set results_dir to a folder {remedy}"

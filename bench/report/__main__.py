@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from bench.records.read import check_results, read_records
-from bench.records.results import RESULTS
+from bench.records.results import RESULTS, write_error_message
 from bench.report.suite.attempts import attempts_of, read_attempts, write_attempts
 from bench.report.sweeps import write_sweeps
 from bench.report.write.html import MAX_MESHES, page_lock, write_page
@@ -34,6 +34,9 @@ def main(arguments: list[str]) -> int:
         return status
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"error: {write_error_message(error)}", file=sys.stderr)
         return 2
 
 

@@ -15,9 +15,9 @@ from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 
 from bench.config import type_of
 from bench.progress import notice
-from bench.records.results import PlannedRun
+from bench.records.results import PlannedRun, write_error_message
 from bench.runner.compose import Composer, composing, parse_override, without_hydra
-from bench.runner.messages import OPTIONAL_GROUPS, Interrupted, quoted, write_error_message
+from bench.runner.messages import OPTIONAL_GROUPS, Interrupted, quoted
 from bench.runner.process import catch_signals, forget_signals, raise_if_stopped, stopped_by
 from bench.runner.sweep import LauncherStopped, work_per_cell
 from bench.tables import extension, names, nearest

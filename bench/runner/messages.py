@@ -57,15 +57,6 @@ def reason_of(error: BaseException, folder: Path | None = None) -> str:
     return f"{text}{suffix}: free space, or set results_dir to a folder on another disk" if is_disk_full else text
 
 
-def write_error_message(error: OSError, results_dir: str | None = None) -> str:
-    """A message on a file that cannot be written, and what to do; names `results_dir` if the error names no file."""
-    path = Path(named) if (named := error.filename or results_dir) else None
-    file = next((parent for parent in path.parents if parent.is_file()), path) if path else None
-    suffix = f" ({file})" if file else ""
-    remedy = "on a local disk, which has locks" if error.errno == errno.ENOLCK else "you can write, or free space"
-    return f"{error.strerror or error}{suffix}: set results_dir to a folder {remedy}"
-
-
 def quoted(text: str) -> str:
     """A text in quotes as Hydra reads it."""
     escaped = re.sub(r"(\\*)('|$)", lambda match: 2 * match[1] + match[2].replace("'", "\\'"), text)

@@ -12,8 +12,8 @@ from bench.config import Isolation, build
 from bench.progress import run_progress
 from bench.records.folder import code_hash, config_hash, free_reserve, locked_folder
 from bench.records.record import Record, RunStatus, append_to_log, now, read_record, write_text
-from bench.records.results import Plan, PlannedRun, ended_record
-from bench.runner.messages import Interrupted, reason_of, write_error_message
+from bench.records.results import Plan, PlannedRun, ended_record, write_error_message
+from bench.runner.messages import Interrupted, reason_of
 from bench.runner.plan import refusal_reasons, reused_ids
 from bench.runner.process import RunInProgress, run_isolated, signals_delayed, stopped_by
 from bench.runner.summary import log_lines, print_run_summary

@@ -26,7 +26,7 @@ CHOICES = {  # the metric that a choice minimises, whether half a pixel suffices
     "by_best": ("stored", False, "fewest numbers as good as the best", "D", 10),
 }
 RING_COLOUR, PIXEL_COLOUR = "#111111", "#47684f"
-MAX_PANELS_IN_TWO_COLUMNS = 6
+MAX_PANELS_IN_TWO_COLUMNS = 8
 LEGEND_LABELS = {label for label, *_ in KINDS.values()} | {heading for _, _, heading, *_ in CHOICES.values()}
 CROWDED = 3  # ratio of FLOPs and of errors, within which names of two candidates would overlap
 MARKER_EXAMPLES = (10, 10_000, 1_000_000)  # stored numbers
@@ -208,7 +208,9 @@ def draw(panels: list[chart.Panel], labels: list[Labels]) -> Figure:
             offset, align = ((-9, -2), "right") if has_lower else ((0, -14), "center")
             axis.annotate(label, (x, y), offset, textcoords="offset points", ha=align, fontsize=6.5)
         axis.margins(y=0.16)
+        axis.tick_params(labelbottom=True)
     axis = figure.axes[0]
+    axis.set_ylim(bottom=axis.get_ylim()[0] / 2)  # all axes share it; names of candidates are below markers
     axis.plot([], [], KINDS["network"][2], mfc="none", color=KINDS["network"][1], label="hollow: error still fell")
     for stored in MARKER_EXAMPLES:
         axis.plot([], [], "o", ms=marker_points(stored), color="#bbbbbb", label=f"{stored:,} numbers")

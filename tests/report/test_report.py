@@ -247,3 +247,10 @@ def test_report_never_imports_torch():
 )
 def test_numbers_have_three_digits_and_a_unit(show, value, text):
     assert show(value) == text
+
+
+def test_a_page_that_cannot_be_written_is_an_error_of_one_line(tmp_path, capsys):
+    (tmp_path / "page").write_text("")
+    assert main([f"results_dir={tmp_path}"]) == 2
+    said = capsys.readouterr().err
+    assert "set results_dir to a folder you can write" in said and len(said.splitlines()) == 1

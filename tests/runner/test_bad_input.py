@@ -15,9 +15,9 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
 from bench.records import folder as run_folder
+from bench.records.results import write_error_message
 from bench.runner.command import message_of, options_of, quote_text
 from bench.runner.compose import parse_override
-from bench.runner.messages import write_error_message
 from bench.runner.plan import refusal_reason
 from bench.setup import priors
 from tests.composing import identified

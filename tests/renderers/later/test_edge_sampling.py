@@ -106,6 +106,15 @@ def test_cells_of_other_rays_are_refused(count):
         replace(rays, cells=CAMERA.resized(48, 48).rays())
 
 
+@each(
+    "change, hint", [({"image": True}, "no image"), ({"cells": CAMERA.double().resized(48, 48).rays()}, "one camera")]
+)
+def test_cells_of_another_kind_are_refused(change, hint):
+    rays = pixel_area.random_rays(CAMERA, 4, 0, 0)
+    with pytest.raises(ValueError, match=hint):
+        replace(rays, **change)
+
+
 def test_the_surface_behind_an_outline_has_the_rest_of_a_split_pixel():
     """A sphere in front of a wall: the sum of the depths, and its derivative, in closed form."""
     leaf = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
