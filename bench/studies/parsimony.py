@@ -53,7 +53,11 @@ Labels = dict[tuple[float, float], str]  # the name of a candidate by its positi
 
 
 def make(runs: Runs) -> Result:
-    """A line per scene and resolution: the sufficient candidates, each the smallest by another quantity."""
+    """A line per scene and resolution: the sufficient candidates, each the smallest by another quantity.
+
+    Of runs of a scene with other rounds or held-out rays, the newest is shown.
+    """
+    runs = runs.only(list({_cell(record): record for record in runs.records}.values()))
     lines = scenes(runs)
     drawn = [_panel(list(group)) for _, group in groupby(lines, key=lambda line: line["scene"])]
     panels, labels = [panel for panel, _ in drawn], [names for _, names in drawn]
@@ -71,6 +75,10 @@ def make(runs: Runs) -> Result:
         figure=draw(panels, labels),
         chart={"panels": panels, "note": POINT},
     )
+
+
+def _cell(record: records.Record) -> tuple[Any, ...]:
+    return medians.scene_of(record), records.setting(record["config"], "view", "resolution"), record["seed"]
 
 
 def scenes(runs: Runs) -> list[Line]:

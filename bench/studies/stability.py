@@ -305,7 +305,7 @@ def _hardest_axis(cells: pd.DataFrame) -> str:
         f"{breakdowns.title(axis)} (*{counts.loc[axis, 'sum']} of {counts.loc[axis, 'size']}*)" for axis in hardest
     )
     among = f", of {len(shares)} axes" if len(shares) > 1 else ""
-    where = f"At the mildest severity, most renderers break on {broken}{among}"
+    where = f"At the mildest severity, the largest share of renderers breaks on {broken}{among}"
     return f"{where}. The table has what breaks each one first."
 
 

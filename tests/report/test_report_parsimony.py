@@ -14,7 +14,7 @@ VIEWS = {"fitted": 12, "held_out": 8, "share": 0.1}
 CONFIG = {"task": {"checks": {"seeds": 20, "drawn": 8}}, "models": {"views": VIEWS, "fit": {"iterations": 100}}}
 
 
-def climbed(results, scene, errors, *, needs, failed=(), status="ok", pixels=None, **metrics) -> None:
+def climbed(results, scene, errors, *, needs, failed=(), status="ok", pixels=None, rounds=None, **metrics) -> None:
     """A run whose candidates have these errors in half pixels of 0.02."""
     known = {"footprint": 0.02, "chamfer_l2": 0.001, "held_out_seeds": 20, "held_out_seeds_within": 0.6}
     known |= {"held_out_seeds_held": 0.95, "recommended_within": 0, "recommended_enough": 1}
@@ -34,7 +34,8 @@ def climbed(results, scene, errors, *, needs, failed=(), status="ok", pixels=Non
     known |= {"frugal.seconds": 1.0} | metrics
     known = {name: value for name, value in known.items() if value is not ...}
     changed = {"status": status, "reason": "" if status == "ok" else "why", "metrics": known if status == "ok" else {}}
-    settings = CONFIG if pixels is None else {**CONFIG, "view": {"resolution": pixels}}
+    settings = CONFIG if rounds is None else {**CONFIG, "task": {**CONFIG["task"], "rounds": rounds}}
+    settings = settings if pixels is None else {**settings, "view": {"resolution": pixels}}
     identity = {"task": "capacity", "dataset": scene, "scene": f"{scene} test 0", "settings": settings}
     write_run(results, "parsimony", None, **identity, **changed)
 
@@ -94,6 +95,15 @@ def test_resolutions_are_lines_of_a_scene_and_fronts_of_its_panel(tmp_path):
     fronts = [each["name"] for each in page.chart["panels"][0]["series"] if each.get("step")]
     assert fronts == [f"front of error and FLOPs at {pixels} pixels" for pixels in (96, 48)]
     assert page.verdict.count("scenes and resolutions") == 1
+
+
+def test_of_a_scene_with_other_rounds_the_newest_run_is_shown_and_other_scenes_stay(tmp_path):
+    climbed(tmp_path, "ball", {"sphere": 0.01, "box": 5}, needs="sphere", rounds=4)
+    climbed(tmp_path, "car", {"sphere": 8, "box": 0.9}, needs="box", rounds=4)
+    climbed(tmp_path, "car", {"sphere": 8, "box": 0.7}, needs="box", rounds=5)
+    page = page_of(tmp_path, "parsimony")
+    assert list(page.table["Scene"]) == ["ball 0", "car 0"] and "Not shown: 1 run of parsimony" in told(page)
+    assert page.data.loc[page.data["rung"].eq("box"), "error"].tolist() == pytest.approx([0.1, 0.014])
 
 
 def test_candidates_stand_as_csv_a_line_each(page):

@@ -75,7 +75,7 @@ def test_a_renderer_has_the_axes_on_which_it_breaks_first_and_the_one_on_which_i
     assert rows.loc["DIST"].tolist()[:3] == [at_once, "fine bumps, 20 % [15, 25]", never]
     firsts = ["thin plate, 30 % [25, 35]", "fine bumps, 40 % [35, 45]"]
     assert rows.loc["DVR"].tolist()[:3] == [*firsts, "narrow gap, 50 % [45, 55]"]
-    assert "At the mildest severity, most renderers break on narrow gap (*1 of 2*)" in page.verdict
+    assert "At the mildest severity, the largest share of renderers breaks on narrow gap (*1 of 2*)" in page.verdict
     labels = [label.get_text() for label in page.figure.axes[0].get_xticklabels()]
     assert labels == ["large alpha", "narrow gap", "fine bumps", "thin plate", "thin wires"]
 
@@ -89,7 +89,7 @@ def test_the_hardest_axis_breaks_the_largest_share_and_equal_breakdowns_inside_s
     for renderer, level in (("DIST", -0.1), ("DVR", -0.1), ("IDR", 0.5)):
         broke(tmp_path, "narrow_view", renderer, level)
     page = page_of(tmp_path, "stability")
-    assert "most renderers break on grazing plane (*1 of 1*), of 8 axes." in page.verdict
+    assert "the largest share of renderers breaks on grazing plane (*1 of 1*), of 8 axes." in page.verdict
     assert "Equal breakdowns in all renderings: DIST; DVR." in page.notes
 
 
