@@ -157,14 +157,9 @@ def check_references(config: DictConfig) -> None:
     if config.get("draw") is not None and "${drawn:" not in text:
         raise ValueError("only a method of method/space reads draw: add +method=space/NAME, or remove draw")
     if not is_own_loss and SILHOUETTE_REFERENCE not in text:
-        tasks = [name for name in names("task") if _reads_silhouette(name)]
+        merged = {name: str(OmegaConf.to_container(_with_defaults("task", name))) for name in names("task")}
+        tasks = [name for name, content in merged.items() if SILHOUETTE_REFERENCE in content]
         raise ValueError(f"silhouette is read only by task={', '.join(tasks)}: remove it, or set one of these tasks")
-
-
-def _reads_silhouette(task: str) -> bool:
-    content = choice("task", task)
-    bases = [base for base in content.get("defaults", []) if base in names("task")]
-    return SILHOUETTE_REFERENCE in str(content) or any(map(_reads_silhouette, bases))
 
 
 def check_names(config: Mapping[str, Any]) -> None:

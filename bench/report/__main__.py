@@ -36,6 +36,8 @@ def main(arguments: list[str]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:
+        if isinstance(error, BrokenPipeError):  # of the printed paths
+            raise
         print(f"error: {write_error_message(error)}", file=sys.stderr)
         return 2
 

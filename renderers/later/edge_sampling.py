@@ -35,7 +35,8 @@ class EdgeSampling(SurfaceRenderer):
     Differentiable in: field parameters and rays. Hits by the implicit rule, exactly, up to `epsilon`. In images and
         with cells, the derivative of a silhouette's area has no bias from a band, except where the outline bends, or
         two parts of it lie, within a cell.
-    Needs: a distance or a bound inside the sphere; near misses are searched within a pixel's width, in field units.
+    Needs: a distance or a bound inside the sphere; near misses are searched within a cell's width, or two
+        if rays are not through centres, in field units.
     Deviates from the paper: an edge point is projected from a near miss, not walked to along the surface; neighbours
         share it; the split does not depend on the outline's direction in the pixel; only the first surface within a
         pixel counts. Rays without an image or cells have no neighbours: a near miss within `width` has the weight 0,

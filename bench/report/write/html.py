@@ -149,12 +149,11 @@ def _copy_assets(folder: Path) -> None:
 
 def _copy_pictures(folder: Path, sources: Iterable[Path]) -> None:
     """Copies pictures into a folder, and removes the others."""
-    names = set()
-    for source in sources:
-        write_file(folder / source.name, source.read_bytes())
-        names.add(source.name)
+    current = {source.name: source for source in sources}
+    for name, source in current.items():
+        write_file(folder / name, source.read_bytes())
     for path in folder.glob("*.png"):
-        if path.name not in names:
+        if path.name not in current:
             path.unlink()
 
 
