@@ -25,6 +25,7 @@ TASKS = {
     "single_view": "Say shape and colour from one image, by a trained network",
     "ablation": "Measure what one rendering costs and how far it is from a float64 reference",
     "gradients": "Compare a renderer's gradients with float64 differences",
+    "area_gradient": "Compare the gradient of a silhouette's area with float64 differences",
     "stability": "Search for the severity at which a renderer breaks",
     "capacity": "Measure how much model a shape needs",
 }
