@@ -237,20 +237,23 @@ COLUMNS = (
     *table.columns(table.word, families="Families", verdict="Verdict", why="Possible cause, or what is missing"),
     table.text("command", "Command, or test"),
 )
-NOTES = (
-    "A ratio compares the errors of two rows, or in DIST, Table 1, their field evaluations. It is a median over shapes "
-    "without those where both rows failed. The 95 % interval of the sign test needs six shapes. The published ratio is "
-    "of the paper's numbers, as a geometric mean over families.",
+RULES = (
+    "A ratio compares the errors of two rows, or their field evaluations. It is a median over shapes without those "
+    "where both rows failed. The 95 % interval of the sign test needs six shapes. The published ratio is of the "
+    "paper's numbers, as a geometric mean over families.",
     "A claim of a smaller error “holds” if the interval is below 1, and “does not hold” if it is above 1. If the "
     "interval shows less than half of the published effect, on a log scale, the verdict is “weaker” if it is below 1, "
     "and “less than half the effect” if it contains 1.",
     f"A claim of no larger error allows ratios up to {MAX_SAME_RATIO}. This margin is ours. The claim “holds” if the "
     "interval is below it. “Larger (size not decided)”: the interval is above 1 and contains the margin.",
+    "Each claim is a separate question, so there is no correction for the number of claims.",
+)
+NOTES = (
+    *RULES,
     "ρ is Spearman's rank correlation of loss and Chamfer distance over the iterations of a run. Its limit of "
     f"{curves.HIGH_RHO} is ours.",
     "With fewer than six shapes, the verdict only states whether the median is as claimed. The algorithm nearly "
     "determines the counts of DIST, Table 1: one shape shows their size. All other cases are “not decided”.",
-    "Each claim is a separate question, so there is no correction for the number of claims.",
     "In DIST, Table 2, all rows of DIST have the paper's 100 iterations and weights. DeepSDF's row has 800 iterations, "
     "the rate and the weight of its official code, true normals, and samples 0.02 scene units from the surface.",
 )
@@ -258,17 +261,25 @@ CHECKED, UNTESTED, AS_CLAIMED = "checked by a test", "not tested", "as claimed"
 
 
 def make(*sources: Runs | None) -> Result:
-    experiments: dict[str, Runs | None] = dict(zip(EXPERIMENTS, sources, strict=True))
-    lines = [_line(claim, experiments.get(claim.experiment)) for claim in CLAIMS]
+    """A line for each claim of DIST and DVR."""
+    question = "Which claims of the DIST and DVR papers hold in our measurements?"
+    return page(CLAIMS, dict(zip(EXPERIMENTS, sources, strict=True)), "Claims of DIST and DVR.", question, NOTES)
+
+
+def page(
+    claims: Sequence[Claim], runs: Mapping[str, Runs | None], title: str, question: str, notes: Sequence[str]
+) -> Result:
+    """A page with a line for each claim, from the runs of each experiment."""
+    lines = [_line(claim, runs.get(claim.experiment)) for claim in claims]
     return Result(
-        merge_runs(*sources),
-        "Claims of DIST and DVR.",
+        merge_runs(*runs.values()),
+        title,
         "Measured and published ratios of the errors or costs of two rows. A failed run has an infinite error.",
-        question="Which claims of the DIST and DVR papers hold in our measurements?",
+        question=question,
         verdict=_verdict([line["verdict"] for line in lines]),
         n=f"{sum(line['shapes'] is not None for line in lines)} measured claims; the table has the shapes of each",
         interval=compare.INTERVAL,
-        remarks=NOTES,
+        remarks=notes,
         columns=COLUMNS,
         lines=lines,
     )

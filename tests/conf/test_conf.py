@@ -3,7 +3,7 @@
 Cells of experiments: tests/conf/test_cells.py.
 """
 
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from functools import cache
 from inspect import signature
 from typing import Any
@@ -181,7 +181,11 @@ def lacking(node: dict[str, Any], known: dict[str, Any]) -> list[str]:
 def test_a_key_of_a_method_is_one_of_the_task_and_the_renderer_that_it_chooses(name, group):
     known = inherited(name, group)
     target = known["_target_"].rpartition(",")[2].rstrip("}")  # perhaps the default of a reference
-    known = dict.fromkeys(signature(get_class(target)).parameters) | known
+    parameters = signature(get_class(target)).parameters
+    known = dict.fromkeys(parameters) | known
+    for key in (key for key in {*known} & {*parameters} if is_dataclass(parameters[key].annotation)):
+        if isinstance(known[key], dict):
+            known[key] = dict.fromkeys(signature(parameters[key].annotation).parameters) | known[key]
     assert lacking(choice("method", name).get(group, {}), known) == []
 
 
