@@ -85,7 +85,8 @@ class AreaGradient:
             field = Meter(prior.decoder.requires_grad_(False).at(code), counts)
             gradients.append(self._gradient(run, field, code, rays).double() / count @ directions)
         record.metrics = _metrics(torch.stack(gradients), truth)
-        record.evaluations = {"value": counts.value // draws, "gradient": counts.gradient // draws}
+        totals = {"value": counts.value, "gradient": counts.gradient, "cost": counts.cost}
+        record.evaluations = {name: total / draws for name, total in totals.items()}
         record.status, record.reason = RunStatus.OK, ""
 
     def _gradient(self, run: RunContext, field: Field, code: Tensor, rays: Rays) -> Float[Tensor, " code_length"]:
