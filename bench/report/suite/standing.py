@@ -70,7 +70,7 @@ def frame_of(attempts: Iterable[Attempt]) -> tuple[pd.DataFrame, dict[str, int]]
     frame = pd.DataFrame(lines, columns=columns, dtype=object).sort_values(["started", "final"])
     frame = frame.astype(dict.fromkeys(("budget", "start", "final", "cost", "waited", "seconds"), float))
     frame = frame.astype({"ok": bool, "tuned": bool}).assign(
-        timed=~(frame["waited"] > MAX_WAIT_FRACTION),
+        timed=frame["seconds"].notna() & ~(frame["waited"] > MAX_WAIT_FRACTION),
         machine=frame["cpu"] + "; " + frame["device"] + "; " + frame["threads"].map(str) + "; " + frame["kernels"],
     )
     counts = frame.drop_duplicates([*KEY, "row", "settings"]).groupby(["set", "tuned", "settings"]).size()
