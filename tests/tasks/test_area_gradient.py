@@ -32,7 +32,7 @@ def test_edge_sampling_has_the_gradient_of_the_area(tmp_path, rays, error):
     assert metrics["area_scale"] == pytest.approx(1, abs=error)
     assert metrics["area_error"] < 2 * error
     assert metrics["area_cosine"] > 0.99
-    assert (metrics["area_noise"] == 0) == (rays == 1)
+    assert ("area_noise" in metrics) == (rays > 1)
 
 
 def test_a_band_has_more_noise_and_the_error_contains_it(tmp_path):

@@ -25,7 +25,8 @@ REMEDY = "take renderer=edge_sampling, relaxed_boundary, neus, opaque, volsdf or
 NEIGHBOURHOOD = 5  # pixels per side: its centre can change only if it has hits and misses
 DEFINITIONS = {
     "area_error, area_noise": "root mean square over draws: of the length of the difference between a draw's "
-    "gradient and the true one; of the difference from the mean over draws; both over the length of the true one",
+    "gradient and the true one; of the difference from the mean over draws; both over the length of the true one. "
+    "There is no noise without draws, with one ray per pixel",
     "area_scale, area_cosine": "component along the true gradient of the mean over draws, over the length of the true "
     "one; cosine between both",
     "evaluations": "of one draw",
@@ -140,9 +141,10 @@ def _metrics(drawn: Float[Tensor, "draws directions"], truth: Float[Tensor, " di
     def deviation(centre: Tensor) -> float:
         return ((drawn - centre).square().sum(dim=1).mean().sqrt() / length).item()
 
+    noise = {"area_noise": deviation(mean)} if len(drawn) > 1 else {}
     return {
         "area_error": deviation(truth),
-        "area_noise": deviation(mean),
+        **noise,
         "area_scale": (mean @ truth / length.square()).item(),
         "area_cosine": torch.cosine_similarity(mean, truth, dim=0).item(),
     }
