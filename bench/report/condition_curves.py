@@ -30,7 +30,7 @@ class Measure:
     key: str
     heading: str
     factor: float = 1.0
-    failed: float = np.inf
+    failed: float = np.inf  # nan: it is left out
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,8 @@ class ConditionCurves:
         for (name, preset), row in frame.groupby(["row", "preset"], sort=False):
             groups = {value: group.set_index(SHAPE).sort_index() for value, group in row.groupby("value")}
             for value, group in groups.items():
-                estimates = {each.key: _median(group[each.key]) for each in self.measures}
+                measured = {each.key: group[each.key].dropna() for each in self.measures}
+                estimates = {key: _median(of_runs) for key, of_runs in measured.items() if len(of_runs)}
                 gain = None if value == self.first else self._gain(group, groups.get(self.first))
                 lines.append(
                     {
@@ -158,7 +159,7 @@ class ConditionCurves:
     def _panel(self, lines: list[Line], measure: Measure) -> chart.Panel:
         rows: dict[tuple[str, str], list[Line]] = {}
         for line in lines:
-            if line["preset"] not in self.only_in_table:
+            if line["preset"] not in self.only_in_table and measure.key in line["estimates"]:
                 rows.setdefault((line["name"], line["preset"]), []).append(line)
         values = sorted({line["value"] for line in lines})
         curves = [
