@@ -37,6 +37,10 @@ class Rays:
         length = torch.linalg.vector_norm(self.directions.detach(), dim=-1)
         if length.numel() and not bool(((length - 1).abs() < 1e-3).all()):
             raise ValueError("directions must have unit length: pass them through torch.nn.functional.normalize")
+        if self.image and len(self.shape) < 2:
+            raise ValueError(
+                f"rays of shape {list(self.shape)} are no image, which has rows and columns: leave image out"
+            )
         if self.cells is not None:
             self._check_cells(self.cells)
 

@@ -15,6 +15,8 @@ NOTES = [
     "With 1 ray, it goes through the centre of each pixel, and nothing is random, so there is no noise. With 4 and 16, "
     "a random ray is drawn in each of 2 x 2 or 4 x 4 squares of the pixel. Error and noise are root mean squares over "
     "16 draws, relative to the true gradient. Scale is that of the mean over the draws, and 1 if exact.",
+    "The scale of UNISURF is small because its 24 samples are farther apart than its width: on a ball with 16 rays, it "
+    "is 0.55, and 0.93 with 128 samples.",
     "Each renderer has its default blur. DIST, DVR, IDR, Newton, Naive, range analysis and the mesh proxy have no "
     "opacity with a gradient: `silhouette=area` refuses them.",
 ]

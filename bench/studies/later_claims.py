@@ -1,7 +1,7 @@
-"""Claims of papers after 2020, as ratios of two errors or costs of measured runs, with the verdicts of `claims`."""
+"""Claims of papers after 2020, as ratios of two errors or costs of measured runs."""
 
-from bench.report.study import Result, Runs, Selection
-from bench.studies.claims import NO_LARGER, RULES, SEEN_ERROR, Claim, page
+from bench.report.claims import NO_LARGER, SEEN_ERROR, Claim
+from bench.report.study import Result, Runs, Selection, claims
 
 PLACE = 6
 RAYS = "view.rays_per_pixel"
@@ -63,7 +63,7 @@ CLAIMS = (
     ),
 )  # fmt: skip
 NOTES = (
-    *RULES,
+    *claims.RULES,
     "Outlines: a prior's code is fitted to one mask, see the page outline. Photographs: 600 iterations on 16 "
     "photographs of 40 x 40 pixels with masks, all rows with IDR's mask loss and one learning rate. The error is over "
     "what photographs see.",
@@ -78,7 +78,7 @@ def make(*sources: Runs | None) -> Result:
     """A line for each claim."""
     runs = dict(zip(EXPERIMENTS, sources, strict=True))
     question = "Which claims of papers after 2020 hold in our measurements?"
-    return page(CLAIMS, runs, "Claims of later papers.", question, NOTES)
+    return claims.page(CLAIMS, runs, "Claims of later papers.", question, NOTES)
 
 
 PAGES = {"later_claims": make}

@@ -146,6 +146,12 @@ def test_a_moved_object_is_seen_as_by_the_camera_that_stays():
         torch.testing.assert_close(projected, expected)
 
 
+def test_a_list_of_rays_is_no_image():
+    directions = vector((0, 0, 1)).expand(7, 3)
+    with pytest.raises(ValueError, match="leave image out"):
+        Rays(torch.zeros_like(directions), directions, image=True)
+
+
 def test_a_camera_shows_what_lies_in_front_of_it_and_within_its_image():
     camera = Camera(torch.tensor([[10.0, 0, 8], [0, 10.0, 4], [0, 0, 1]]), torch.eye(4), 8, 16)
     corners = torch.tensor([[-0.79, -0.39, 1.0], [0.79, 0.39, 1.0]])

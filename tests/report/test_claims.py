@@ -6,12 +6,14 @@ from pathlib import Path
 import pytest
 
 from bench.config import names
+from bench.report.claims import NO_LARGER, NO_RUNS, SMALLER, Claim, verdict_of
 from bench.report.data.statistics import Interval
-from bench.studies.claims import CLAIMS, NO_LARGER, NO_RUNS, SMALLER, Claim, verdict_of
+from bench.studies import claims, later_claims
 from tests.looped import each
 from tests.report.test_report_paper import page_of, write_curve, write_run
 
 SHAPES = tuple(range(6))
+CLAIMS = (*claims.CLAIMS, *later_claims.CLAIMS)
 
 
 @each(
