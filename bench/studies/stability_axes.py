@@ -40,6 +40,7 @@ SHARE_COLUMNS = ("level", "severity", "successes", "trials", "share", "low", "hi
 COST_COLUMNS = (
     *(table.text("row", "Renderer"), table.Column("axes"), *table.estimate("rank", "Mean rank")),
     *table.columns(table.word, at_once="Axes broken at the mildest", never="Axes survived"),
+    table.Column("without", "Axes refused or failed"),
     *(table.Column("cost", "Field evaluations per ray"), table.PRESET),
 )
 
@@ -156,7 +157,8 @@ def _cost(cells: pd.DataFrame, row: str, rank: statistics.Interval) -> dict[str,
     """The line of a renderer on the shared axes. Its cost leaves out axes on which it breaks at once."""
     ends = {name: int(cells[name].sum()) for name in ("at_once", "never")}
     cost = cells["evaluations_per_ray"][~cells["at_once"]].median()
-    return {"row": row, "axes": len(cells), "rank": rank, **ends, "cost": cost}
+    without = int((~cells["is_measured"]).sum())
+    return {"row": row, "axes": len(cells), "rank": rank, **ends, "without": without, "cost": cost}
 
 
 def _shares(runs: Runs, record: records.Record, cell: dict[str, Any]) -> pd.DataFrame:

@@ -187,9 +187,9 @@ def test_ranks_leave_out_settings_that_a_renderer_lacks_and_a_refused_field_is_t
     page = page_of(tmp_path, "stability_cost")
     assert page.chart["panels"][0]["y"]["reversed"] and page.figure.axes[0].yaxis_inverted()
     rows = page.data.set_index("row")
-    columns = ["axes", "at_once", "never", "cost"]
-    assert rows.loc["DIST", columns].tolist() == [4, 2, 0, 3.0]
-    assert rows.loc["DVR", columns].tolist() == [4, 0, 1, 4.0]
+    columns = ["axes", "at_once", "never", "without", "cost"]
+    assert rows.loc["DIST", columns].tolist() == [4, 2, 0, 0, 3.0]
+    assert rows.loc["DVR", columns].tolist() == [4, 0, 1, 1, 4.0]
     assert rows["rank"].to_dict() == {"DIST": pytest.approx(6.5 / 4), "DVR": pytest.approx(5.5 / 4)}
 
 
