@@ -28,7 +28,7 @@ CHOICES = {  # the metric that a choice minimises, whether half a pixel suffices
 RING_COLOUR, PIXEL_COLOUR = "#111111", "#47684f"
 MAX_PANELS_IN_TWO_COLUMNS = 8
 LEGEND_LABELS = {label for label, *_ in KINDS.values()} | {heading for _, _, heading, *_ in CHOICES.values()}
-CROWDED = 3  # ratio of FLOPs and of errors, within which names of two candidates would overlap
+CROWDED = {"FLOPs": 12, "error": 5}  # ratios within which names of two candidates would overlap
 MARKER_EXAMPLES = (10, 10_000, 1_000_000)  # stored numbers
 NOTES = (
     "All candidates are fitted to depth and silhouettes of the same views with the same rays, in rounds until a round "
@@ -212,8 +212,9 @@ def draw(panels: list[chart.Panel], labels: list[Labels]) -> Figure:
     figure = chart.draw(panels, 2.0 * rows + 1.1, rows, legend=0, sharey=True, sharex=True)
     for axis, names in zip(figure.axes, labels, strict=False):
         for (x, y), label in names.items():
-            has_lower = any(1 / CROWDED < x / a < CROWDED and 1 < y / b < CROWDED for a, b in names)
-            offset, align = ((-9, -2), "right") if has_lower else ((0, -14), "center")
+            lower = [a for a, b in names if max(x / a, a / x) < CROWDED["FLOPs"] and 1 < y / b < CROWDED["error"]]
+            sideways: tuple[tuple[int, int], str] = ((9, -2), "left") if lower and x > lower[0] else ((-9, -2), "right")
+            offset, align = sideways if lower else ((0, -14), "center")
             axis.annotate(label, (x, y), offset, textcoords="offset points", ha=align, fontsize=6.5)
         axis.margins(y=0.16)
         axis.tick_params(labelbottom=True)
