@@ -1,34 +1,37 @@
 """Compares the gradient of a silhouette's area with central differences, with one or several rays per pixel."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bench.evaluate.reference import MIN_STEP, RADIUS, fingerprint, in_float64
+from bench.evaluate.reference import RADIUS, fingerprint, in_float64, trace_exactly
 from bench.records.record import RunStatus, digest
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior, load_or_make
 from bench.solve.pixel_area import random_rays
-from bench.tasks.gradients.finite_differences import outline_steps, subrays
+from bench.tasks.gradients.finite_differences import outline_steps
 from renderers.boundary import render_checked
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Field, Meter, estimate_lipschitz
 from renderers.rendering import Unsupported, check_kind
-from renderers.tracing.reference import trace
 
+VERSION = 1  # of the true gradients; raise it when they change
+REACH = 0.15  # pixels: rays farther from the outline keep their hit or miss in a step
 REMEDY = "take renderer=edge_sampling, relaxed_boundary, neus, opaque, volsdf or unisurf"
-NEIGHBOURHOOD = 5  # pixels per side: its centre can change only if it has hits and misses
 DEFINITIONS = {
-    "area_error, area_noise": "root mean square over draws: of the length of the difference between a draw's "
-    "gradient and the true one; of the difference from the mean over draws; both over the length of the true one. "
-    "There is no noise without draws, with one ray per pixel",
-    "area_scale, area_cosine": "component along the true gradient of the mean over draws, over the length of the true "
-    "one; cosine between both",
+    "area_error": "length of the difference between a draw's gradient and the true one, divided by the length of the "
+    "true one; root mean square over the draws",
+    "area_bias": "the same of the mean over the draws",
+    "area_noise": "standard deviation of the draws from their mean, divided by the length of the true gradient; absent "
+    "with one ray per pixel, where nothing is drawn",
+    "area_scale": "component of the mean gradient along the true one, divided by the length of the true one",
+    "area_cosine": "cosine between the mean gradient and the true one",
     "evaluations": "of one draw",
 }
 
@@ -42,7 +45,7 @@ class AreaGradient:
     Args:
         directions: number of random orthogonal directions of the code.
         draws: of several rays per pixel. One ray goes through the centre, without a draw.
-        shift: in pixels; a step of the differences moves most of the outline by so much, to either side.
+        shift: in pixels; a step of the differences moves 90 % of the surface near the outline by less, to either side.
         supersampling: rays per side of a pixel, for the differences.
     """
 
@@ -58,7 +61,7 @@ class AreaGradient:
             check_at_least(
                 f"task.{name}", getattr(self, name), 1, "conf/task/area_gradient.yaml holds values that work"
             )
-        check_positive("task.shift", self.shift, "0.15 moves the outline within a pixel")
+        check_positive("task.shift", self.shift, "0.05 moves the outline within a pixel")
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput without a network that was fitted to the scene's shape."""
@@ -106,44 +109,50 @@ class AreaGradient:
         """Central differences of the area along directions of the code, in float64; read from `folder` or stored."""
         exact, camera = in_float64(prior), camera.double()
         settings = [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.height, camera.width]
-        key = digest(
-            {"weights": fingerprint(prior), "camera": settings, "task": asdict(self), "at": directions.tolist()}
-        )
+        settings += [VERSION, self.shift, self.supersampling, directions.tolist()]
+        key = digest({"weights": fingerprint(prior), "settings": settings})
 
         def field_at(shift: Tensor) -> Field:
             return exact.decoder.at(exact.codes[0] + shift)
 
         def make() -> dict[str, Tensor]:
-            lipschitz = estimate_lipschitz(exact.decoder.at(exact.codes[0]), radius=RADIUS)
-            tracing = {"lipschitz": lipschitz, "least_step": MIN_STEP, "radius": RADIUS}
-            hit = trace(field_at(torch.zeros_like(exact.codes[0])), camera.rays(), **tracing).hit
-            both = torch.stack([hit, ~hit])[:, None].float()
-            both = torch.nn.functional.max_pool2d(both, NEIGHBOURHOOD, stride=1, padding=NEIGHBOURHOOD // 2)
-            pixels = (both.amin(dim=0)[0] > 0).flatten().nonzero().squeeze(-1)
+            base = exact.decoder.at(exact.codes[0])
+            lipschitz, count = estimate_lipschitz(base, radius=RADIUS), self.supersampling
+            hit = trace_exactly(base, camera.rays(), lipschitz).hit
+            outline = near_outline(hit, 1).flatten().nonzero().squeeze(-1)
             steps = outline_steps(
-                field_at, directions, camera=camera, pixels=pixels, shift=self.shift, lipschitz=lipschitz
+                field_at, directions, camera=camera, pixels=outline, shift=self.shift, lipschitz=lipschitz
             )
-            rays, rates = subrays(camera, pixels, self.supersampling), []
+            fine_hit = hit.repeat_interleave(count, 0).repeat_interleave(count, 1)
+            rays = camera.resized(camera.height * count, camera.width * count).rays().flat()
+            wide = near_outline(fine_hit, count).flatten().nonzero().squeeze(-1)
+            fine_hit.view(-1)[wide] = trace_exactly(base, rays[wide], lipschitz).hit
+            rays, rates = rays[near_outline(fine_hit, ceil(REACH * count)).flatten()], []
             for direction, step in zip(directions.T, steps.tolist(), strict=True):
                 ahead, behind = (
-                    trace(field_at(sign * step * direction), rays, **tracing).hit.double() for sign in (1, -1)
+                    trace_exactly(field_at(sign * step * direction), rays, lipschitz).hit.sum() for sign in (1, -1)
                 )
-                rates.append((ahead - behind).mean(dim=1).sum() / (2 * step))
+                rates.append((ahead - behind).double() / count**2 / (2 * step))
             return {"rates": torch.stack(rates)}
 
         return load_or_make(folder, f"area-{key}", make)["rates"]
 
 
+def near_outline(hit: Bool[Tensor, "height width"], reach: int) -> Bool[Tensor, "height width"]:
+    """Rays of an image with both hits and misses among the rays that are at most `reach` rows and columns away."""
+    both = torch.stack([hit, ~hit])[:, None].float()
+    for size in ((2 * reach + 1, 1), (1, 2 * reach + 1)):  # one dimension after the other takes less time
+        both = torch.nn.functional.max_pool2d(both, size, stride=1, padding=(size[0] // 2, size[1] // 2))
+    return both.amin(dim=0)[0] > 0
+
+
 def _metrics(drawn: Float[Tensor, "draws directions"], truth: Float[Tensor, " directions"]) -> dict[str, float]:
     """The metrics of `DEFINITIONS`."""
     mean, length = drawn.mean(dim=0), torch.linalg.vector_norm(truth)
-
-    def deviation(centre: Tensor) -> float:
-        return ((drawn - centre).square().sum(dim=1).mean().sqrt() / length).item()
-
-    noise = {"area_noise": deviation(mean)} if len(drawn) > 1 else {}
+    noise = {"area_noise": (drawn.var(dim=0).sum().sqrt() / length).item()} if len(drawn) > 1 else {}
     return {
-        "area_error": deviation(truth),
+        "area_error": ((drawn - truth).square().sum(dim=1).mean().sqrt() / length).item(),
+        "area_bias": (torch.linalg.vector_norm(mean - truth) / length).item(),
         **noise,
         "area_scale": (mean @ truth / length.square()).item(),
         "area_cosine": torch.cosine_similarity(mean, truth, dim=0).item(),
