@@ -21,7 +21,7 @@ from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Field, Meter, estimate_lipschitz
 from renderers.rendering import Unsupported, check_kind
 
-VERSION = 1  # of the true gradients; raise it when they change
+VERSION = 1  # raise it when the true gradients change
 REACH = 0.15  # pixels: rays farther from the outline keep their hit or miss in a step
 REMEDY = "take renderer=edge_sampling, relaxed_boundary, neus, opaque, volsdf or unisurf"
 DEFINITIONS = {
