@@ -36,6 +36,8 @@ RULES = (
     "and “less than half the effect” if it contains 1.",
     f"A claim of no larger error allows ratios up to {MAX_SAME_RATIO}. This margin is ours. The claim “holds” if the "
     "interval is below it. “Larger (size not decided)”: the interval is above 1 and contains the margin.",
+    "With fewer than six shapes, the verdict only states whether the median is as claimed. All other cases are “not "
+    "decided”.",
     "Each claim is a separate question, so there is no correction for the number of claims.",
 )
 CHECKED, UNTESTED, AS_CLAIMED = "checked by a test", "not tested", "as claimed"
@@ -104,7 +106,8 @@ def _verdict(verdicts: list[str]) -> str:
         "shapes, without a test."
     )
     others = f"Others: {'; '.join(f'{kind} {count}' for kind, count in tested.items()) or 'none'}."
-    rest = f"Tests of this project check {kinds.count(CHECKED)} claims, and {kinds.count(UNTESTED)} are not tested."
+    checked = format.plural(kinds.count(CHECKED), "claim")
+    rest = f"Tests of this project check {checked}, and {kinds.count(UNTESTED)} are not tested."
     return f"{measured} {others} {rest}"
 
 
@@ -164,7 +167,7 @@ def _as_number(text: str) -> float | str:
 
 
 def verdict_of(claim: Claim, ratio: statistics.Interval) -> str:
-    """The verdict of a measured ratio on a claim, by the rules in `NOTES`."""
+    """The verdict of a measured ratio on a claim, by the rules in `RULES`."""
     least, most = claim.expected
     if not ratio.has_ends:
         as_claimed = least <= ratio.value <= most

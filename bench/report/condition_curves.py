@@ -30,7 +30,7 @@ class Measure:
     key: str
     heading: str
     factor: float = 1.0
-    failed: float = np.inf  # nan: it is left out
+    failed: float = np.inf  # nan leaves the run out
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class ConditionCurves:
         heading: of the condition.
         first: the value that the verdict and the ratios compare with.
         compared: the value of the verdict.
-        measures: the metrics. Ratios and the verdict are of the first. A run that ended without progress counts with
-            its result.
+        measures: the metrics. Ratios and the verdict are of the first, whose `failed` is a number. A run that ended
+            without progress counts with its result.
         title, question, verdict: text; `verdict` begins the sentence with the ratios.
         notes: of the runs.
         absent: the value of the condition in runs without the key.

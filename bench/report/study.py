@@ -2,13 +2,13 @@
 
 `records` reads values of one run, `statistics` and `compare` summarise many runs, `table` has the columns, `chart` and
 `gallery` draw, `figure_style` and `style` have the looks of figures, and `format` writes numbers. `breakdowns` reads
-stress tests; `claims` compares claims of papers with measured ratios.
+stress tests.
 """
 
 # ruff: noqa: F401 - these imports are re-exported
 from bench.pictures import figure_style, style
 from bench.records import format
-from bench.report import breakdowns, claims, compare, condition_curves, conditions, gallery, medians
+from bench.report import breakdowns, compare, condition_curves, conditions, gallery, medians
 from bench.report.compare import published
 from bench.report.data import curves, records, statistics
 from bench.report.data.runs import NoFolder, Runs, Selection, merge_runs

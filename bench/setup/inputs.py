@@ -319,7 +319,8 @@ def _check(task: Task, inputs: RunInputs, index: int) -> None:
     if not inputs.field.of_prior and not getattr(task, "takes_field", False):
         raise ValueError(f"the task {name} does not take field={inputs.field.name}: remove it")
     if inputs.views.rays_per_pixel > 1 and not getattr(task, "takes_rays_per_pixel", False):
-        raise ValueError(f"the task {name} compares one ray per pixel: remove view.rays_per_pixel, see conf/README.md")
+        remedy = "remove view.rays_per_pixel. conf/README.md names the tasks that take it"
+        raise ValueError(f"the task {name} compares one ray per pixel: {remedy}")
     holds_out = getattr(getattr(task, "optimiser", None), "ends", "") == "held_out"
     if holds_out and not (getattr(task, "takes_one_view", False) and inputs.field.of_prior):
         raise ValueError("effort=needed is only for task=completion with field=prior: set effort=full")

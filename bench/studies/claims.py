@@ -7,8 +7,8 @@ from operator import getitem
 import numpy as np
 
 from bench.records.published import DVR_TABLE2
-from bench.report.claims import COST, DISORDER, NO_LARGER, SEEN_ERROR, SMALLER, Claim
-from bench.report.study import Result, Runs, Selection, claims, curves, published, statistics
+from bench.report.claims import COST, DISORDER, NO_LARGER, RULES, SEEN_ERROR, SMALLER, Claim, page
+from bench.report.study import Result, Runs, Selection, curves, published, statistics
 
 PLACE = 5
 EXPERIMENTS = ("table1_large", "table2_claims", "table3", "fig5", "fig10", "fig12", "dvr_table1", "dvr_table2")
@@ -176,11 +176,10 @@ CLAIMS = (
     ),
 )  # fmt: skip
 NOTES = (
-    *claims.RULES,
+    *RULES,
     "ρ is Spearman's rank correlation of loss and Chamfer distance over the iterations of a run. Its limit of "
     f"{curves.HIGH_RHO} is ours.",
-    "With fewer than six shapes, the verdict only states whether the median is as claimed. The algorithm nearly "
-    "determines the counts of DIST, Table 1: one shape shows their size. All other cases are “not decided”.",
+    "The algorithm nearly determines the counts of DIST, Table 1: one shape shows their size.",
     "In DIST, Table 2, all rows of DIST have the paper's 100 iterations and weights. DeepSDF's row has 800 iterations, "
     "the rate and the weight of its official code, true normals, and samples 0.02 scene units from the surface.",
 )
@@ -189,7 +188,7 @@ NOTES = (
 def make(*sources: Runs | None) -> Result:
     """A line for each claim of DIST and DVR."""
     question = "Which claims of the DIST and DVR papers hold in our measurements?"
-    return claims.page(CLAIMS, dict(zip(EXPERIMENTS, sources, strict=True)), "Claims of DIST and DVR.", question, NOTES)
+    return page(CLAIMS, dict(zip(EXPERIMENTS, sources, strict=True)), "Claims of DIST and DVR.", question, NOTES)
 
 
 PAGES = {"claims": make}

@@ -64,3 +64,13 @@ def test_rows_are_compared_with_the_reference_on_common_shapes():
     frame = made.frame.assign(value=made.frame["config.key"])
     ratios = page(reference="a")._against_reference(frame[(frame.row == "A") | (frame.solid != "sofa 0")])
     assert ratios.keys() == {"B"} and ratios["B"].value == pytest.approx(0.5) and len(ratios["B"].points) == 7
+
+
+def test_a_metric_that_no_run_of_a_line_has_is_neither_shown_nor_drawn():
+    made = runs_of({("A", 1): 2.0, ("A", 4): 1.0})
+    frame = made.frame.assign(value=made.frame["config.key"], cost=1.0)
+    frame["psnr"] = frame["psnr"].where(frame["value"] == 4)
+    lines = page()._lines(frame)
+    assert [set(line["estimates"]) for line in lines] == [{"error"}, {"error", "psnr"}]
+    drawn = page()._panel(lines, page().measures[1])["series"]
+    assert [series["x"] for series in drawn] == [[1]]  # the position of 4 among the values

@@ -437,6 +437,7 @@ class Slow(Exact):
 def test_a_handicap_is_significant_and_a_twin_is_not_on_twelve_scenes(tmp_path, monkeypatch):
     (tmp_path / "odd.py").write_text(MINE)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path.cwd()}")
+    monkeypatch.syspath_prepend(tmp_path)  # the sweep is composed in this process
     results = tmp_path / "results"
     asked = ["set=complete", f"results_dir={results}"]
     own = {"Exact": "tests.user_renderer.Mine", "Shifted": "odd.Shifted", "Slow": "odd.Slow"}

@@ -62,8 +62,9 @@ class Standing:
 def frame_of(attempts: Iterable[Attempt]) -> tuple[pd.DataFrame, dict[str, int]]:
     """A line per attempt, the oldest first; a key may have several. Also the number of attempts left out, by row.
 
-    Its columns: the fields of the attempt, `ok`, `tuned`, `machine`, and `timed` (the machine was not busy). Attempts
-    with other settings than most of their set are left out; settings of tuned rows are compared separately.
+    Its columns: the fields of the attempt, `ok`, `tuned`, `machine`, and `timed` (the machine was not busy, and
+    the seconds are stored). Attempts with other settings than most of their set are left out; settings of tuned rows
+    are compared separately.
     """
     lines = [vars(attempt) | {"ok": attempt.ok, "tuned": attempt.tuned} for attempt in attempts]
     columns = [*Attempt.__dataclass_fields__, "ok", "tuned"]
