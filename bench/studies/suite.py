@@ -63,6 +63,7 @@ TUNED = (
     "Tuned: the settings of conf/tuned.yaml, chosen on validation shapes. They may have another silhouette loss. The "
     "effects of settings and loss are not separated."
 )
+MAX_NAMED = 4  # rows in a verdict; the table has the ranks of all
 
 
 def make(*several: Runs | None) -> Result:
@@ -308,9 +309,8 @@ def leaders(ranked: Ranking, when: str) -> str:
     tied = [row for row in ranked.progress if row not in (first[0], *behind)]
     less = f"{format.plural(len(behind), 'other')}: {', '.join(names[row] for row in behind)}"
     if len(behind) > len(tied) > 0:
-        return (
-            f"{when}, {rows[0]} makes significantly more progress than all but {', '.join(names[row] for row in tied)}."
-        )
+        others = ", ".join(names[row] for row in tied) if len(tied) <= MAX_NAMED else str(len(tied))
+        return f"{when}, {rows[0]} makes significantly more progress than all but {others}."
     than = f"significantly more than {less}" if behind else "and cannot be distinguished from any other"
     return f"{when}, {rows[0]} makes the most progress, {than}."
 
