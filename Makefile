@@ -8,7 +8,7 @@ unexport PYTHONDONTWRITEBYTECODE  # with it, each of some hundred processes comp
 demo: .venv/ready ## set up once, then complete a sofa from 100 depth points
 	$(BIN)/python -m bench task=completion renderer=dist
 
-test: .venv/ready-dev ## set up once, then the tests (5 to 8 minutes on 2 quiet cores)
+test: .venv/ready-dev ## set up once, then the tests (3 to 8 minutes on 2 quiet cores)
 	$(BIN)/python -m pytest -n 2 --dist loadfile --durations=10
 
 test-slow: .venv/ready-dev ## the minutes-long tests

@@ -101,10 +101,8 @@ def _verdict(verdicts: list[str]) -> str:
     kinds = [verdict.split(",")[0] for verdict in verdicts]
     tested = {kind: kinds.count(kind) for kind in dict.fromkeys(kinds) if kind not in (CHECKED, UNTESTED)}
     holds, few = tested.pop("holds", 0), tested.pop(AS_CLAIMED, 0)
-    measured = (
-        f"*{holds}* of {holds + few + sum(tested.values())} measured comparisons hold; {few} are as claimed on few "
-        "shapes, without a test."
-    )
+    on_few = f"; {few} are as claimed on few shapes, without a test" if few else ""
+    measured = f"*{holds}* of {holds + few + sum(tested.values())} measured comparisons hold{on_few}."
     others = f"Others: {'; '.join(f'{kind} {count}' for kind, count in tested.items()) or 'none'}."
     checked = format.plural(kinds.count(CHECKED), "claim")
     rest = f"Tests of this project check {checked}, and {kinds.count(UNTESTED)} are not tested."

@@ -94,7 +94,7 @@ class ConditionCurves:
         return (
             *(text("name", "Method"), Column("value", self.heading, show="{:g}".format), Column("shapes", "Shapes")),
             *(Column(first.key, first.heading), *ends(first.key, lambda line: line["estimates"][first.key])),
-            *(Column("ratio", f"Ratio to that at {self.first:g}"), *ends("ratio", lambda line: line["gain"])),
+            *(Column("ratio", f"Median ratio to that at {self.first:g}"), *ends("ratio", lambda line: line["gain"])),
             *(Column(each.key, each.heading) for each in self.measures[1:]),
             Column("cost", "Field evaluations"),
             text("failed", "Not ok"),

@@ -16,8 +16,9 @@ NOTES = [
     "With 1 ray per pixel, the ray goes through the centre. With 4 and 16, a random ray is drawn in each of 2 x 2 or "
     "4 x 4 squares of the pixel.",
     "Error: that of the gradient of one draw. It has two parts: bias, the error of the mean over 16 draws, and noise,"
-    " the standard deviation of the draws. The bias contains a quarter of the noise. With 1 ray nothing is drawn, so "
-    "the error is the bias. All are relative to the length of the true gradient.",
+    " the standard deviation of the draws. The mean of 16 draws still has a quarter of the noise, so a smaller bias "
+    "cannot be distinguished from 0. With 1 ray nothing is drawn, so the error is the bias. All are relative to the "
+    "length of the true gradient.",
     "Each renderer has its default blur. Field evaluations are of one draw. DIST, DVR, IDR, Newton, Naive, range "
     "analysis and the mesh proxy have no opacity with a gradient: `silhouette=area` refuses them.",
 ]

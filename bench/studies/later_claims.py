@@ -20,13 +20,16 @@ CLAIMS = (
         "later_opaque", "later_volsdf",
     ),
     _claim(
-        "Radiance Surfaces", "the loss of samples has a smaller error than that of blended colours",
+        "Radiance Surfaces", "a colour loss on each sample has a smaller error than one on the blended colour",
         "later_neus_samples", "later_neus",
     ),
     _claim(
         "Stochastic preconditioning", "blurred points reduce the error of a hash grid", "later_hash_blur", "later_hash"
     ),
-    _claim("HotSpot", "the heat loss does not impair the surface", "later_idr_heat", "later_idr", NO_LARGER),
+    _claim(
+        "HotSpot", "the heat loss does not impair the surface (error at most 25 % larger)", "later_idr_heat",
+        "later_idr", NO_LARGER,
+    ),
     Claim(
         "HotSpot", "with the heat loss, a march needs fewer evaluations",
         why="needs the evaluations of the march alone: those of a run include the points of the loss",

@@ -236,7 +236,7 @@ def _chosen(line: Line, choice: str) -> str:
     cost, by_pixel, *_ = CHOICES[choice]
     candidate = line.get(choice)
     if candidate is None:
-        return "none confirmed" if line["ok"] else format.MISSING
+        return "none passes further views" if line["ok"] else format.MISSING
     unit = "FLOPs" if cost == FLOPS else "numbers"
     unchecked = ", unchecked" if candidate.held(by_pixel=by_pixel) is None else ""
     return f"{candidate.label}{unchecked}: {candidate.numbers[cost]:,} {unit}, {table.thousandfold(candidate.error)}"

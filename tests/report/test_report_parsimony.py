@@ -79,8 +79,8 @@ def test_a_row_has_a_choice_by_each_quantity(page):
 
 @pytest.mark.parametrize(("held", "choice"), [
     ({"box.held_enough": 0.5, "union_3.held_enough": 0.85}, "union 3: 30 numbers, 16.0"),
-    ({"box.held_enough": 0.5, "union_3.held_enough": 0.5, "grid_24.held_enough": 0.5}, "none confirmed"),
-    ({"held_out_seeds_held": 0.25}, "none confirmed"),  # a record with the check of the recommended candidate only
+    ({"box.held_enough": 0.5, "union_3.held_enough": 0.5, "grid_24.held_enough": 0.5}, "none passes further views"),
+    ({"held_out_seeds_held": 0.25}, "none passes further views"),  # only the recommended candidate has a check
 ])  # fmt: skip
 def test_a_choice_that_further_views_do_not_confirm_is_not_made(tmp_path, held, choice):
     climbed(tmp_path, "car", {"sphere": 8, "box": 0.9, "union_3": 0.8, "grid_24": 0.2}, needs="box", **held)
