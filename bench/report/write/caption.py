@@ -99,7 +99,8 @@ def _setup(runs: Runs) -> str:
     }
     loss = shared_loss(runs.records)
     known_parts = [parts[name] for name in runs.selection.setup if parts[name]]
-    return "; ".join(known_parts + ([f"every row with {loss}"] if loss else []))
+    text = "; ".join(known_parts + ([f"every row with {loss}"] if loss else []))
+    return text[:1].upper() + text[1:]
 
 
 def _outcome(runs: Runs) -> str:
