@@ -7,7 +7,8 @@ import torch
 
 from bench.config import load
 from bench.records.record import RunStatus
-from bench.tasks.gradients.area import AreaGradient, _metrics, near_outline
+from bench.tasks.gradients.area import AreaGradient, _metrics
+from bench.tasks.gradients.finite_differences import near_outline
 from renderers.rendering import Unsupported
 from tests.looped import each
 from tests.tiny import ball_prior, camera_of, run_of

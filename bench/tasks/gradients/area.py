@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from bench.evaluate.reference import RADIUS, fingerprint, in_float64, trace_exactly
@@ -14,12 +14,12 @@ from bench.records.record import RunStatus, digest
 from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior, load_or_make
 from bench.solve.pixel_area import random_rays
-from bench.tasks.gradients.finite_differences import outline_steps
+from bench.tasks.gradients.finite_differences import near_outline, orthogonal_directions, outline_steps
 from renderers.boundary import render_checked
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
 from renderers.field import Counts, Field, Meter, estimate_lipschitz
-from renderers.rendering import Unsupported, check_kind
+from renderers.rendering import Renderer, Unsupported, check_kind
 
 VERSION = 1  # raise it when the true gradients change
 REACH = 0.15  # pixels: rays farther from the outline keep their hit or miss in a step
@@ -77,8 +77,7 @@ class AreaGradient:
         record.definitions = DEFINITIONS
         prior, camera = inputs.fitted(), inputs.scene.view.camera
         generator = torch.Generator().manual_seed(inputs.seed)
-        axes = torch.randn(prior.codes.shape[1], self.directions, generator=generator, dtype=torch.float64)
-        directions = torch.linalg.qr(axes).Q
+        directions = orthogonal_directions(prior.codes.shape[1], self.directions, generator)
         truth = self._true_gradient(prior, camera, directions, inputs.cache)
         count, gradients = inputs.scene.rays_per_pixel, []
         draws = self.draws if count > 1 else 1
@@ -87,21 +86,11 @@ class AreaGradient:
             rays = random_rays(camera, count, inputs.seed, draw) if count > 1 else camera.rays()
             code = prior.codes[0].detach().clone().requires_grad_(True)
             field = Meter(prior.decoder.requires_grad_(False).at(code), counts)
-            gradients.append(self._gradient(run, field, code, rays).double() / count @ directions)
+            gradients.append(_gradient(inputs.renderer, field, code, rays).double() / count @ directions)
         record.metrics = _metrics(torch.stack(gradients), truth)
         totals = {"value": counts.value, "gradient": counts.gradient, "cost": counts.cost}
         record.evaluations = {name: total / draws for name, total in totals.items()}
         record.status, record.reason = RunStatus.OK, ""
-
-    def _gradient(self, run: RunContext, field: Field, code: Tensor, rays: Rays) -> Float[Tensor, " code_length"]:
-        """The gradient of the sum of the rays' opacities for the code."""
-        renderer = run.inputs.renderer
-        check_kind(renderer, field)
-        rendering = render_checked(renderer, field, rays)
-        if rendering.volume is None:
-            raise Unsupported(f"{type(renderer).__name__} has no opacity with a gradient: {REMEDY}")
-        (gradient,) = torch.autograd.grad(rendering.opacity.sum(), code)
-        return gradient
 
     def _true_gradient(
         self, prior: Prior, camera: Camera, directions: Float[Tensor, "code_length directions"], folder: Path
@@ -138,12 +127,14 @@ class AreaGradient:
         return load_or_make(folder, f"area-{key}", make)["rates"]
 
 
-def near_outline(hit: Bool[Tensor, "height width"], reach: int) -> Bool[Tensor, "height width"]:
-    """Rays of an image with both hits and misses among the rays that are at most `reach` rows and columns away."""
-    both = torch.stack([hit, ~hit])[:, None].float()
-    for size in ((2 * reach + 1, 1), (1, 2 * reach + 1)):  # one dimension after the other takes less time
-        both = torch.nn.functional.max_pool2d(both, size, stride=1, padding=(size[0] // 2, size[1] // 2))
-    return both.amin(dim=0)[0] > 0
+def _gradient(renderer: Renderer, field: Field, code: Tensor, rays: Rays) -> Float[Tensor, " code_length"]:
+    """The gradient of the sum of the rays' opacities for the code."""
+    check_kind(renderer, field)
+    rendering = render_checked(renderer, field, rays)
+    if rendering.volume is None:
+        raise Unsupported(f"{type(renderer).__name__} has no opacity with a gradient: {REMEDY}")
+    (gradient,) = torch.autograd.grad(rendering.opacity.sum(), code)
+    return gradient
 
 
 def _metrics(drawn: Float[Tensor, "draws directions"], truth: Float[Tensor, " directions"]) -> dict[str, float]:

@@ -170,7 +170,9 @@ def outline_steps(
     rays, base_field = camera.rays().flat()[pixels], field_at(torch.zeros_like(directions[:, 0]))
     hits = trace(base_field, rays, lipschitz=lipschitz, least_step=1e-3, radius=1.0)
     if not bool(hits.hit.any()):
-        raise ValueError("no pixel of the outline hits at its middle: draw more by task.outline")
+        raise ValueError(
+            "no pixel of the outline hits at its middle: raise view.resolution, or task.outline of task=gradients"
+        )
     points, distance = hits.points[hits.hit], hits.distance[hits.hit]
     slopes = torch.linalg.vector_norm(autograd_gradients(base_field, points), dim=-1)
     footprints = distance / camera.intrinsics[0, 0]
@@ -181,6 +183,21 @@ def outline_steps(
         pixel_shifts = (ahead - behind).abs() / (2 * STEP) / slopes / footprints
         steps.append(shift / pixel_shifts.quantile(0.9).clamp_min(1e-12))
     return torch.stack(steps)
+
+
+def orthogonal_directions(
+    length: int, count: int, generator: torch.Generator
+) -> Float[Tensor, "code_length directions"]:
+    """Random orthogonal directions of a code, as unit columns in float64."""
+    return torch.linalg.qr(torch.randn(length, count, generator=generator, dtype=torch.float64)).Q
+
+
+def near_outline(hit: Bool[Tensor, "height width"], reach: int) -> Bool[Tensor, "height width"]:
+    """Rays of an image with both hits and misses among the rays that are at most `reach` rows and columns away."""
+    both = torch.stack([hit, ~hit])[:, None].float()
+    for size in ((2 * reach + 1, 1), (1, 2 * reach + 1)):  # one dimension after the other takes less time
+        both = torch.nn.functional.max_pool2d(both, size, stride=1, padding=(size[0] // 2, size[1] // 2))
+    return both.amin(dim=0)[0] > 0
 
 
 def subrays(camera: Camera, pixels: Int[Tensor, " m"], count: int) -> Rays:

@@ -13,7 +13,15 @@ from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.observed_view import gradients_at
 from bench.solve.solve import check_field_gradient
-from bench.tasks.gradients.finite_differences import Paint, differences, image_differences, outline_steps, subrays
+from bench.tasks.gradients.finite_differences import (
+    Paint,
+    differences,
+    image_differences,
+    near_outline,
+    orthogonal_directions,
+    outline_steps,
+    subrays,
+)
 from renderers.boundary import check_gradients, render_checked
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
@@ -102,8 +110,7 @@ class Gradients:
         check_kind(inputs.renderer, prior.decoder.at(prior.codes[0]))
         check_field_gradient(inputs.renderer)
         generator = torch.Generator().manual_seed(inputs.seed)
-        axes = torch.randn(len(subject.code), self.directions, generator=generator, dtype=torch.float64)
-        directions = torch.linalg.qr(axes).Q
+        directions = orthogonal_directions(len(subject.code), self.directions, generator)
         metrics: dict[str, float] = {}
         bands = _bands(reference, subject.camera)
         for number, (band, pixels) in enumerate(bands.items()):
@@ -308,8 +315,7 @@ def _bands(reference: Reference, camera: Camera) -> dict[str, Int[Tensor, " some
 
 def _outline(hit: Bool[Tensor, "height width"]) -> Int[Tensor, " some"]:
     """Pixels whose 3 x 3 neighbourhood has both hits and misses, as indices into the flattened image."""
-    has_both = torch.nn.functional.max_pool2d(torch.stack([hit, ~hit])[:, None].float(), 3, stride=1, padding=1)
-    return (has_both.amin(dim=0)[0] > 0).flatten().nonzero().squeeze(-1)
+    return near_outline(hit, 1).flatten().nonzero().squeeze(-1)
 
 
 def _draw(pixels: Int[Tensor, " some"], count: int, generator: torch.Generator) -> Int[Tensor, " few"]:
