@@ -26,6 +26,7 @@ class Shot:
         mask: true on the object; None if it is unknown.
         depth: camera z in scene units, 0 at pixels of unknown depth; None without any depth.
         normals: unit, in world coordinates, 0 at pixels of unknown normal; None without any normal.
+        covered: the fraction of each pixel on the object; None if it is unknown.
     """
 
     name: str
@@ -34,10 +35,11 @@ class Shot:
     mask: Bool[Tensor, "height width"] | None
     depth: Float[Tensor, "height width"] | None = None
     normals: Float[Tensor, "height width 3"] | None = None
+    covered: Float[Tensor, "height width"] | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
-        for name in ("colours", "mask", "depth", "normals"):
+        for name in ("colours", "mask", "depth", "normals", "covered"):
             image = getattr(self, name)
             if image is not None and tuple(image.shape[:2]) != size:
                 raise ValueError(f"{name} must have the camera's size, {size}, not {tuple(image.shape[:2])}")

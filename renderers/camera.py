@@ -1,5 +1,6 @@
 """Cameras and rays. Axes: x right, y down, z forward (OpenCV); the centre of pixel (column, row) is at +0.5."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isqrt
 
@@ -16,8 +17,9 @@ class Rays:
     are neighbours in the view.
 
     Args:
-        cells: of rays [height, width, k * k] in pixels of k x k equal cells, column by column, with a ray anywhere in
-            each cell: the image [height * k, width * k] of rays through the cells' centres, with the same gradient.
+        cells: of rays [*batch, height, width, k * k] in pixels of k x k equal cells, column by column, with a ray
+            anywhere in each cell: the image [*batch, height * k, width * k] of rays through the cells' centres, with
+            the same gradient.
             `bench.solve.pixel_area.random_rays` makes both.
     """
 
@@ -45,14 +47,14 @@ class Rays:
             self._check_cells(self.cells)
 
     def _check_cells(self, cells: "Rays") -> None:
-        height, width, count = self.shape if len(self.shape) == 3 else (0, 0, 0)
+        *batch, height, width, count = self.shape if len(self.shape) >= 3 else (0, 0, 0)
         side = isqrt(count)
         if self.image or not cells.image:
             raise ValueError("only rays that are no image have cells, and the cells are an image: set image=")
-        if count != side**2 or (*cells.shape,) != (height * side, width * side):
+        if count != side**2 or (*cells.shape,) != (*batch, height * side, width * side):
             raise ValueError(
-                f"rays {list(self.shape)} cannot have cells {list(cells.shape)}: rays [height, width, k * k] have "
-                "cells [height * k, width * k], without a batch; leave cells out"
+                f"rays {list(self.shape)} cannot have cells {list(cells.shape)}: rays [*batch, height, width, k * k] "
+                "have cells [*batch, height * k, width * k]; leave cells out"
             )
         if cells.origins.dtype != self.origins.dtype or cells.origins.device != self.origins.device:
             raise ValueError(
@@ -97,6 +99,12 @@ class Rays:
             torch.nn.functional.normalize(_block_mean(self.directions, factor), dim=-1),
             image=True,
         )
+
+
+def stacked(rays: Sequence[Rays]) -> Rays:
+    """Rays of one shape as [n, *rays], without their cells."""
+    origins, directions = (torch.stack([getattr(each, name) for each in rays]) for name in ("origins", "directions"))
+    return _rays_unchecked(origins, directions, rays[0].image)
 
 
 def _rays_unchecked(origins: Tensor, directions: Tensor, image: bool = False, cells: Rays | None = None) -> Rays:

@@ -1,5 +1,6 @@
 """Several rays per pixel: random rays in its area, and what they predict of the pixel."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import isqrt
 
@@ -8,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.solve.pixel_draw import generator_of
-from renderers.camera import Camera, Rays
+from renderers.camera import Camera, Rays, stacked
 from renderers.rendering import RayObservation, Rendering
 
 SEED_OF_RAYS = 7  # added to seeds, so that the rays of pixels do not follow the draw of the pixels
@@ -20,11 +21,22 @@ def random_rays(camera: Camera, count: int, seed: int, iteration: int) -> Rays:
     Args:
         count: a square number.
     """
-    side, shape = isqrt(count), (camera.height, camera.width, count, 2)
-    corner = torch.cartesian_prod(torch.arange(side), torch.arange(side))
-    inside = torch.rand(shape, generator=generator_of(seed + SEED_OF_RAYS, iteration))
-    rays = camera.rays(((corner + inside) / side - 0.5).to(camera.intrinsics))
+    side, generator = isqrt(count), generator_of(seed + SEED_OF_RAYS, iteration)
+    rays = camera.rays(random_offsets((camera.height, camera.width), count, generator).to(camera.intrinsics))
     return replace(rays, cells=camera.resized(camera.height * side, camera.width * side).rays())
+
+
+def random_offsets(pixels: Sequence[int], count: int, generator: torch.Generator) -> Float[Tensor, "*pixels count 2"]:
+    """Offsets from the centres of pixels, right and down, in pixels: a random one in each of `count` equal cells."""
+    side = isqrt(count)
+    corner = torch.cartesian_prod(torch.arange(side), torch.arange(side))
+    return (corner + torch.rand(*pixels, count, 2, generator=generator)) / side - 0.5
+
+
+def random_rays_of(cameras: Sequence[Camera], count: int, seed: int, iteration: int) -> Rays:
+    """`random_rays` [cameras, height, width, count] of cameras with equal numbers of pixels."""
+    rays = [random_rays(camera, count, seed + index, iteration) for index, camera in enumerate(cameras)]
+    return replace(stacked(rays), cells=stacked([ray.cells for ray in rays]))
 
 
 def mean_depth(

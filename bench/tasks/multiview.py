@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import radians
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,13 +13,14 @@ from bench.setup.inputs import RunContext, RunInputs
 from bench.shape_prior import Prior
 from bench.solve.latent_code import CodePenalty, CodeProblem, Terms, initial_rotations, total
 from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSettings, with_affordable_rays
+from bench.solve.pixel_area import observation_of, random_rays_of
 from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import check_field_gradient, metric_definitions, solve_and_draw
-from datasets.photographs import Photography
+from datasets.photographs import Photography, with_areas
 from datasets.scene import Scene
 from datasets.shot import Shot
 from renderers.boundary import render_checked
-from renderers.camera import Rays
+from renderers.camera import Rays, stacked
 from renderers.checks import BadInput, check_at_least, check_positive
 from renderers.field import Field
 from renderers.rendering import RayObservation, Renderer, Rendering, at_iteration
@@ -96,6 +97,8 @@ class Multiview:
     pixel_block: int = 1
     encoder: CodeEncoder | None = None
 
+    takes_rays_per_pixel: ClassVar[bool] = True
+
     def __post_init__(self) -> None:
         check_at_least("task.views_per_step", self.views_per_step, 1, "the paper uses 8")
         check_at_least("task.neighbour", self.neighbour, 1, "1 is the closest next view")
@@ -161,7 +164,11 @@ class Multiview:
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
         photographs = self.images.take(scene.raycaster, scene.view.camera.zoomed(self.focal), seed=scene_seed)
-        return self.problem_of(prior, PhotometricLoss(self, renderer, photographs, device, seed=scene_seed), generator)
+        rays = scene.rays_per_pixel
+        if rays > 1:
+            photographs = with_areas(photographs, scene.raycaster)
+        loss = PhotometricLoss(self, renderer, photographs, device, seed=scene_seed, rays_per_pixel=rays)
+        return self.problem_of(prior, loss, generator)
 
     def problem_of(self, prior: Prior, photometric_loss: "PhotometricLoss", generator: torch.Generator) -> CodeProblem:
         """The problem of a loss; `generator` draws the initial codes."""
@@ -177,7 +184,7 @@ class Multiview:
             self.code,
             photometric_loss.compare,
             observed,
-            2 * photometric_loss.per_step,
+            (photometric_loss.rays_per_pixel + 1) * photometric_loss.per_step,
             photometric_loss.colours.device,
             initial=codes,
             initial_similarities=initial_rotations(self.starts)
@@ -197,7 +204,11 @@ class Multiview:
 
 
 class PhotometricLoss:
-    """Compares photographs: `compare` renders a field's depths and warps the photographs by them."""
+    """Compares photographs: `compare` renders a field's depths and warps the photographs by them.
+
+    With several rays per pixel, a pixel is compared if the neighbour sees the points of all of its rays, by the mean of
+    their colours in the neighbour. The silhouette loss then compares fractions of pixels; see `bench.solve.pixel_area`.
+    """
 
     def __init__(
         self,
@@ -208,16 +219,19 @@ class PhotometricLoss:
         *,
         from_user: bool = False,
         seed: int = 0,
+        rays_per_pixel: int = 1,
     ):
         """Stores the photographs. The user's photographs have any order: neighbours are chosen by distance.
 
         Args:
-            seed: of the pixels that iterations compare.
+            seed: of the pixels that iterations compare, and of their rays.
+            rays_per_pixel: see `datasets.views.ViewSampler`; the neighbours have one.
 
         Raises:
             BadInput: if photographs differ in size.
         """
         self.settings, self.renderer, self.from_user, self.seed = settings, renderer, from_user, seed
+        self.rays_per_pixel = rays_per_pixel
         if len({photograph.colours.shape for photograph in photographs}) > 1:
             raise BadInput("task=multiview compares photographs of one size, and these differ: leave others out")
         self.cameras = [photograph.camera.to(device) for photograph in photographs]
@@ -225,13 +239,16 @@ class PhotometricLoss:
         self.colours = torch.stack([photograph.colours for photograph in photographs]).to(device)
         self.per_step = min(settings.views_per_step, len(photographs))
         count = len(photographs)
-        masks = [shot.mask for shot in photographs if settings.silhouette_weight and shot.mask is not None]
+        observed = "covered" if rays_per_pixel > 1 else "mask"
+        masks = [
+            getattr(shot, observed) for shot in photographs if settings.silhouette_weight and shot.mask is not None
+        ]
         self.neighbours = [(view + settings.neighbour) % count for view in range(count)]
         if from_user:
             centres = torch.stack([camera.center for camera in self.cameras])
             nearest = torch.cdist(centres, centres).argsort(dim=1)  # the first is the view itself
             self.neighbours = nearest[:, min(settings.neighbour, count - 1)].tolist()
-        self.masks = torch.stack(masks).to(device) if masks else None
+        self.masks = torch.stack(masks).to(device) if masks else None  # with several rays per pixel, fractions
         pixels = torch.ones(self.colours.shape[1:3], dtype=torch.bool)
         self.draw = PixelDraw(pixels, settings.pixel_block, seed)  # the same in each view
 
@@ -259,6 +276,10 @@ class PhotometricLoss:
         renderer, images = at_iteration(self.renderer, iteration), self.images_at(iteration)
         views, neighbours = map(list, zip(*self.pairs(iteration), strict=True))
         rays, observed = self._stack_rays(views), images[views]
+        several = self.rays_per_pixel > 1
+        if several:
+            cameras = [self.cameras[view] for view in views]
+            rays = random_rays_of(cameras, self.rays_per_pixel, self.seed, iteration)
         is_drawn = drawn is not None
         if is_drawn:
             drawn = drawn.to(self.colours.device)
@@ -268,9 +289,12 @@ class PhotometricLoss:
         visible = self._visible(renderer, field, rendering, neighbours, is_drawn)
         differences = []
         for k, other in enumerate(neighbours):
-            pixels, _ = self.cameras[other].project(rendering.points[k][visible[k]])
+            shown = visible[k].all(-1) if several else visible[k]
+            pixels, _ = self.cameras[other].project(rendering.points[k][shown])
             warped, inside = sample(images[other], pixels)
-            differences.append((warped - observed[k][visible[k]])[inside].abs().mean(-1))
+            if several:
+                warped, inside = warped.mean(1), inside.all(1)
+            differences.append((warped - observed[k][shown])[inside].abs().mean(-1))
         errors = torch.cat(differences)
         if not len(errors) and not is_drawn:
             raise CannotContinue(f"no point of the shape is seen by two neighbouring views at iteration {iteration}")
@@ -278,7 +302,8 @@ class PhotometricLoss:
         terms = {"photometric": self.settings.photometric_weight * photometric}
         if self.masks is not None:
             masks = self.masks[views].flatten(1)[:, drawn] if is_drawn else self.masks[views]
-            observation = RayObservation(masks, torch.full_like(rendering.distance, torch.nan))
+            unknown = torch.full_like(masks, torch.nan, dtype=rendering.distance.dtype)
+            observation = observation_of(masks, unknown, rendering) if several else RayObservation(masks, unknown)
             silhouette = self.settings.silhouette(renderer, field, rays, rendering, observation)
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms
@@ -318,9 +343,7 @@ class PhotometricLoss:
         return inside & close & (interpolated[..., 1] > MIN_INTERPOLATION_WEIGHT)
 
     def _stack_rays(self, views: list[int]) -> Rays:
-        chosen = [self.rays[view] for view in views]
-        origins = torch.stack([rays.origins for rays in chosen])
-        return Rays(origins, torch.stack([rays.directions for rays in chosen]), image=True)
+        return stacked([self.rays[view] for view in views])
 
     def images_at(self, iteration: int) -> Float[Tensor, "views height width 3"]:
         """The images at an iteration; `coarse_blur` blurs them in the first half."""

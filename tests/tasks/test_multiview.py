@@ -85,6 +85,26 @@ def test_drawn_pixels_are_compared_as_among_all(scene):
     assert problem.rays_per_iteration * 4 == problem_of(scene).rays_per_iteration
 
 
+@each("rays", [1, 4])
+@each("block", [1, 2])
+@each("name", ["dist", "relaxed_boundary", "edge_sampling"])
+def test_several_rays_per_pixel_compare_fractions_and_the_truth_costs_least(scene, name, block, rays):
+    silhouette = load("silhouette", "cross_entropy_sharp" if name == "dist" else "area")
+    settings = {"silhouette_weight": 10.0, "silhouette": silhouette, "pixel_block": block}
+    problem = replace(SETTINGS, **settings).problem(
+        replace(scene, rays_per_pixel=rays), PRIOR, load("renderer", name), seed=0, device=CPU
+    )
+    assert problem.rays_per_iteration == (rays + 1) * 4 * (16 // block) ** 2
+    terms = [problem.compare(sphere(radius), 1) for radius in (0.4, 0.5, 0.6)]
+    for term in ("photometric", "silhouette"):
+        costs = [each_term[term].item() for each_term in terms]
+        assert costs[1] < 0.7 * min(costs[0], costs[2]), (term, costs)
+    radius = torch.tensor(0.4, requires_grad=True)
+    (slope,) = torch.autograd.grad(problem.compare(sphere(radius), 1)["silhouette"], radius)
+    if (rays, block) == (4, 1) or name == "dist":
+        assert slope < 0  # a larger sphere covers more
+
+
 def test_a_draw_that_both_views_see_nowhere_is_no_failure(scene):
     """Of a small shape, 4 pixels of 256 seldom show it; all pixels do, and without it a run cannot continue."""
     drawn, small = overrides(scene, pixel_block=8), sphere(0.3)

@@ -86,8 +86,9 @@ class CameraMotions:
 
 
 def moved(rays: Rays, twists: Float[Tensor, "photographs 6"], photograph: Int[Tensor, " n"]) -> Rays:
-    """Rays after each camera saw the object moved by its twist, see `Camera.with_object_moved`."""
+    """Rays [n, ...] after each camera saw the object moved by its twist, see `Camera.with_object_moved`."""
+    photograph = photograph.view(-1, *[1] * (len(rays.shape) - 1)).expand(rays.shape)
     back = torch.linalg.inv(rigid(twists))[photograph]
-    turn = back[:, :3, :3]
-    origins = (turn @ rays.origins[..., None])[..., 0] + back[:, :3, 3]
+    turn = back[..., :3, :3]
+    origins = (turn @ rays.origins[..., None])[..., 0] + back[..., :3, 3]
     return Rays(origins, torch.nn.functional.normalize((turn @ rays.directions[..., None])[..., 0], dim=-1))

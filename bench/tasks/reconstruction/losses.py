@@ -8,6 +8,7 @@ from torch import Tensor
 
 from bench.solve.latent_code import Terms, total
 from bench.solve.observed_view import DEPTH_LOSSES, depth_error, gradients_at, normal_error
+from bench.solve.pixel_area import observation_of
 from bench.tasks.reconstruction.background import Background
 from bench.tasks.reconstruction.pixels import Pixels
 from renderers.boundary import render_checked
@@ -25,6 +26,10 @@ NEIGHBOUR_CUBE_SIDE = 2e-3  # scene units: a neighbour is drawn in this cube; DV
 @dataclass(frozen=True)
 class Losses:
     """Weights of the terms; 0 leaves a term out. Sums over rays are divided by the number of all rays.
+
+    With several rays per pixel, a colour is the mean over the rays of a pixel, and without a background it is compared
+    in pixels that the object fills; a surface's is the mean over hits. The silhouette loss compares fractions of pixels
+    (`bench.solve.pixel_area`).
 
     Args:
         colour: weight of the l1 error of colours, over hits on the foreground (DVR, Eq. 12). Volume renderers: of the
@@ -96,9 +101,10 @@ class Losses:
             pixels: the compared pixels; for `colour_gradient` in groups of four, see `Stack.draw`.
             background: the colours behind the shape. With it, colours are compared along all rays, without masks.
         """
+        self._check_several(pixels, background)
         rendering = render_checked(renderer, metered, pixels.rays)
-        inside = rendering.hit if pixels.mask is None else rendering.hit & pixels.mask
-        points, rays = rendering.points[inside], len(inside)
+        inside = pixels.inside(rendering.hit)
+        points, rays = rendering.points[inside], inside.numel()
         gradients = gradients_at(metered, points)
         normals = torch.nn.functional.normalize(gradients, dim=-1)
         terms: Terms = {}
@@ -112,6 +118,10 @@ class Losses:
             terms["depth"] = self.depth * error.sum() / rays
         if self.silhouette_weight and pixels.mask is not None:
             observed = RayObservation(pixels.mask, pixels.guide)
+            if pixels.several:
+                unknown = torch.full_like(pixels.covered, torch.nan)
+                guide = unknown if pixels.guide is None else pixels.guide
+                observed = observation_of(pixels.covered, guide, rendering)
             loss = self.silhouette(renderer, metered, pixels.rays, rendering, observed)
             terms["silhouette"] = self.silhouette_weight * loss
         if self.smoothness:
@@ -144,7 +154,7 @@ class Losses:
         background: Background | None,
     ) -> Terms:
         """The terms of colours; `gradients` are those of the field at hits inside of the masks."""
-        rays, volume = len(pixels.colours), rendering.volume
+        count, volume = len(pixels.colours), rendering.volume
         if volume is not None and pixels.mask is None and background is None:
             reason = "needs masks: without them it would paint what is behind too"
             raise BadInput(f"{type(renderer).__name__} {reason}; +task.background=sphere learns what is behind")
@@ -153,27 +163,42 @@ class Losses:
                 raise BadInput(f"{type(renderer).__name__} has no samples: take task.losses.colour_of=blended")
             if pixels.mask is None:
                 raise BadInput("task.losses.colour_of=samples needs masks: take colour_of=blended")
-            return {"colour": self.colour * _sample_errors(shape, metered, pixels, volume)[pixels.mask].sum() / rays}
-        inside = rendering.hit if pixels.mask is None else rendering.hit & pixels.mask
-        compared = inside if background is None else torch.ones_like(inside)
+            return {"colour": self.colour * _sample_errors(shape, metered, pixels, volume)[pixels.mask].sum() / count}
+        inside, flat = pixels.inside(rendering.hit), pixels.rays.flat()
+        behind = torch.zeros_like(flat.directions) if background is None else background(flat)
         if volume is None:
-            colours = shape.colours(rendering.points[inside], gradients, pixels.rays.directions[inside])
-            if background is not None:
-                colours = background(pixels.rays).index_put((inside,), colours)
+            surface = shape.colours(rendering.points[inside], gradients, pixels.rays.directions[inside])
+            colours = behind.index_put((inside.flatten(),), surface)
+            weight = inside if background is None else torch.ones_like(inside)
         else:
-            colours = _volume_colours(shape, metered, pixels.rays, volume)
-            if background is not None:
-                colours = colours + (1 - rendering.opacity[:, None]) * background(pixels.rays)
-            elif pixels.mask is not None:
-                compared = pixels.mask
-                colours = colours[compared]
-        difference = torch.zeros_like(pixels.colours).index_put((compared,), colours - pixels.colours[compared])
+            colours = (
+                _volume_colours(shape, metered, flat, volume) + (1 - rendering.opacity.flatten()[:, None]) * behind
+            )
+            weight = pixels.inside(torch.ones_like(inside)) if background is None else torch.ones_like(inside)
+        per_pixel = weight.view(count, -1)
+        compared = per_pixel.any(-1)
+        mean = (colours.view(count, -1, 3) * per_pixel[..., None]).sum(1) / per_pixel.sum(-1).clamp_min(1)[:, None]
+        difference = torch.where(compared[:, None], mean - pixels.colours, 0.0)
         terms: Terms = {}
         if self.colour:
-            terms["colour"] = self.colour * difference.abs().sum() / rays
+            terms["colour"] = self.colour * difference.abs().sum() / count
         if self.colour_gradient:
-            terms["colour_gradient"] = self.colour_gradient * _neighbour_error(difference, compared) / rays
+            terms["colour_gradient"] = self.colour_gradient * _neighbour_error(difference, compared) / count
         return terms
+
+    def _check_several(self, pixels: Pixels, background: Background | None) -> None:
+        """Raises BadInput for several rays per pixel with terms of single rays."""
+        if not pixels.several:
+            return
+        observations = {"depth": pixels.distance, "normals": pixels.normals}
+        used = [
+            f"task.losses.{name}=0"
+            for name, observed in observations.items()
+            if getattr(self, name) and observed is not None
+        ]
+        used += ["task.losses.colour_of=blended"] if self.colour_of == SAMPLES else []
+        if used:
+            raise BadInput(f"several rays per pixel compare colours and masks: set {' '.join(used)}")
 
 
 def _volume_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "n 3"]:

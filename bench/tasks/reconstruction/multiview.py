@@ -53,8 +53,9 @@ class MultiviewOnPhotographs(Multiview, PhotographTask):
         record.notes = [*record.notes, subject.summary]
 
         def make(task: MultiviewOnPhotographs) -> CodeProblem:
+            options = {"seed": inputs.seed, "rays_per_pixel": inputs.views.rays_per_pixel}
             shots, device = subject.input_shots, inputs.device
-            loss = PhotometricLoss(task, inputs.renderer, shots, device, from_user=True, seed=inputs.seed)
+            loss = PhotometricLoss(task, inputs.renderer, shots, device, from_user=True, **options)
             return task.problem_of(inputs.prior, loss, torch.Generator().manual_seed(inputs.seed))
 
         problem = with_affordable_rays(self, make)

@@ -1,16 +1,19 @@
 """The pixels of photographs of any sizes as one list, and random draws from it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bench.solve.pixel_area import random_offsets
 from bench.tasks.reconstruction.subject import given_distances
 from datasets.shot import Shot
-from renderers.camera import Rays, sphere_span
+from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import BadInput
+
+FILLED = 0.999  # fraction of a pixel from which the object fills it; undistorted masks are interpolated
 
 
 @dataclass(frozen=True)
@@ -18,7 +21,7 @@ class Pixels:
     """Pixels with their rays and observations.
 
     Args:
-        rays: rays through the pixels' centres.
+        rays: rays [n] through the pixels' centres, or several [n, count] of each pixel.
         colours: RGB from 0 to 1.
         depth_per_distance: the depth of the point at distance 1 along the ray.
         mask: true on the object; None without masks.
@@ -26,6 +29,7 @@ class Pixels:
         guide: distances that a silhouette loss may use, in the same format.
         normals: given normals, 0 for pixels without one; None if no pixel has one.
         photograph: index of each pixel's photograph; None if they share a camera.
+        covered: the fraction of each pixel on the object; None if it is unknown.
     """
 
     rays: Rays
@@ -36,6 +40,18 @@ class Pixels:
     guide: Float[Tensor, " n"] | None
     normals: Float[Tensor, "n 3"] | None
     photograph: Int[Tensor, " n"] | None = None
+    covered: Float[Tensor, " n"] | None = None
+
+    @property
+    def several(self) -> bool:
+        """Whether each pixel has several rays."""
+        return len(self.rays.shape) > 1
+
+    def inside(self, hit: Bool[Tensor, " *rays"]) -> Bool[Tensor, " *rays"]:
+        """The rays among `hit` whose pixel is on the object: by its mask, or filled by it if it has several rays."""
+        if self.mask is None:
+            return hit
+        return hit & (self.covered > FILLED)[:, None] if self.several else hit & self.mask
 
     def __getitem__(self, index: Int[Tensor, " m"]) -> "Pixels":
         tensors = {column.name: getattr(self, column.name) for column in fields(self)}
@@ -51,12 +67,14 @@ class Stack:
         useful: indices of pixels that may be drawn.
         corners: indices of pixels that may be drawn as the upper left pixel of a 2 x 2 patch.
         width: width of each pixel's photograph.
+        steps: of each photograph, the world vectors from a pixel to the next at camera z 1: to the right, and down.
     """
 
     pixels: Pixels
     useful: Int[Tensor, " m"]
     corners: Int[Tensor, " k"]
     width: Int[Tensor, " n"]
+    steps: Float[Tensor, "photographs 2 3"]
 
     @staticmethod
     def build(shots: Sequence[Shot], guide: Sequence[Float[Tensor, "_ _"]] | None, device: torch.device) -> "Stack":
@@ -67,6 +85,7 @@ class Stack:
         distances = given_distances(shots) if any(shot.depth is not None for shot in shots) else []
         masks = [shot.mask.flatten() for shot in shots if shot.mask is not None]
         normals = [shot.normals.reshape(-1, 3) for shot in shots if shot.normals is not None]
+        areas = [shot.covered.flatten() for shot in shots if shot.covered is not None]
         pixels = Pixels(
             all_rays.to(device),
             torch.cat([shot.colours.reshape(-1, 3) for shot in shots]).to(device),
@@ -76,6 +95,7 @@ class Stack:
             torch.cat([distance.flatten() for distance in guide]).to(device) if guide else None,
             torch.cat(normals).to(device) if normals else None,
             torch.cat([torch.full((ray.shape[0],), index) for index, ray in enumerate(rays)]).to(device),
+            torch.cat(areas).to(device) if areas else None,
         )
         in_sphere = sphere_span(all_rays)[2]
         inner = torch.cat([_upper_left(shot) for shot in shots])
@@ -83,7 +103,8 @@ class Stack:
         if not bool((in_sphere & inner).any()):
             raise BadInput("no ray meets the unit sphere: the cameras do not look at the object")
         useful, corners = in_sphere.nonzero().squeeze(-1), (in_sphere & inner).nonzero().squeeze(-1)
-        return Stack(pixels, useful.to(device), corners.to(device), width.to(device))
+        steps = torch.stack([_pixel_steps(shot.camera) for shot in shots])
+        return Stack(pixels, useful.to(device), corners.to(device), width.to(device), steps.to(device))
 
     def draw(self, count: int, *, patches: bool, seed: int) -> Pixels:
         """Draws `count` random pixels on their device; with `patches`, as groups of four: 2 x 2 pixels by rows."""
@@ -95,6 +116,19 @@ class Stack:
             right, below = corner % 2, corner // 2
             chosen = (chosen[:, None] + right + below * self.width[chosen, None]).flatten()
         return self.pixels[chosen]
+
+    def with_rays(self, pixels: Pixels, count: int, generator: torch.Generator) -> Pixels:
+        """Pixels with `count` random rays in the area of each, see `bench.solve.pixel_area`."""
+        at_unit_depth = pixels.rays.directions / pixels.depth_per_distance[:, None]
+        offsets = random_offsets((len(at_unit_depth),), count, generator).to(at_unit_depth)
+        directions = at_unit_depth[:, None] + offsets @ self.steps[pixels.photograph].to(at_unit_depth)
+        origins = pixels.rays.origins[:, None].expand_as(directions)
+        return replace(pixels, rays=Rays(origins, torch.nn.functional.normalize(directions, dim=-1)))
+
+
+def _pixel_steps(camera: Camera) -> Float[Tensor, "2 3"]:
+    """See `Stack.steps`."""
+    return torch.linalg.inv(camera.intrinsics)[:, :2].T @ camera.camera_to_world[:3, :3].T
 
 
 def _upper_left(shot: Shot) -> Bool[Tensor, " pixels"]:

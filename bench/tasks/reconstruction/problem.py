@@ -14,6 +14,7 @@ from bench.evaluate.evaluate import Evaluation
 from bench.evaluate.state import State
 from bench.pictures.filmstrip import Shown
 from bench.solve.latent_code import Terms
+from bench.solve.pixel_area import SEED_OF_RAYS
 from bench.solve.pixel_draw import generator_of
 from bench.tasks.reconstruction.background import OneColour, OutsideSphere
 from bench.tasks.reconstruction.blur import PointBlur
@@ -45,18 +46,23 @@ class ReconstructionProblem:
     model: Learnt
     losses: Losses
     renderer: Renderer
-    rays_per_iteration: int
+    pixels_per_iteration: int
     iterations: int
     seed: int
     motions: CameraMotions
     background: Behind | None = None
     blur: PointBlur = field(default_factory=PointBlur)
+    rays_per_pixel: int = 1
     counts: Counts = field(default_factory=Counts)
 
     @property
     def parameters(self) -> list[Tensor]:
         more = [] if self.background is None else self.background.parameters()
         return [*self.model.parameters(), *more, *([self.motions.numbers] if self.motions.learnt else [])]
+
+    @property
+    def rays_per_iteration(self) -> int:
+        return self.pixels_per_iteration * self.rays_per_pixel
 
     @property
     def tracked(self) -> tuple[str, ...]:
@@ -101,7 +107,11 @@ class ReconstructionProblem:
         """The terms and their sum, over new random pixels in each iteration."""
         patches = self.losses.colour_gradient > 0
         seed = generator_of(self.seed, iteration).initial_seed()
-        pixels = self.motions.apply(self.stack.draw(self.rays_per_iteration, patches=patches, seed=seed))
+        pixels = self.stack.draw(self.pixels_per_iteration, patches=patches, seed=seed)
+        if self.rays_per_pixel > 1:
+            rays = generator_of(self.seed + SEED_OF_RAYS, iteration)
+            pixels = self.stack.with_rays(pixels, self.rays_per_pixel, rays)
+        pixels = self.motions.apply(pixels)
         pixels = self.blur.apply(pixels, iteration, self.iterations, self.seed)
         shape = self.model.field
         renderer = at_iteration(self.renderer, iteration)

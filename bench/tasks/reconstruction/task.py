@@ -48,7 +48,7 @@ class Reconstruction(PhotographTask):
         images, longest, held_out, masks, depths: see `PhotographTask`.
         guide: distances that a silhouette loss may use, such as `silhouette=occupancy` with `occupied_at: depth` (DVR,
             Sec. 3.4): "none", "given" depths, or "hull": given depths, and at other pixels the visual hull's.
-        rays: number of pixels drawn in each iteration.
+        rays: number of pixels drawn in each iteration, each with `view.rays_per_pixel` rays.
         appearance: settings of the field, except its size.
         auto: settings of `field=auto`.
         losses: losses of the renderings.
@@ -77,6 +77,7 @@ class Reconstruction(PhotographTask):
     blur_share: float = BLUR_SHARE
 
     takes_field: ClassVar[bool] = True
+    takes_rays_per_pixel: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -156,11 +157,11 @@ class Reconstruction(PhotographTask):
         iterations, blur = self.optimiser.iterations, PointBlur(self.blur_points, self.blur_share)
 
         def problem(task: Reconstruction) -> ReconstructionProblem:
-            rays = max(self.rays // task.pixel_block**2, 4)
+            pixels = max(self.rays // task.pixel_block**2, 4)
             motions = cameras.CameraMotions(shots, true, self.cameras == cameras.REFINE, inputs.device)
             background = behind.make(self.background)
             learnt_background = None if background is None else background.to(inputs.device)
-            args = self.losses, inputs.renderer, rays, iterations, inputs.seed, motions, learnt_background, blur
-            return ReconstructionProblem(subject, stack, model, *args)
+            args = self.losses, inputs.renderer, pixels, iterations, inputs.seed, motions, learnt_background, blur
+            return ReconstructionProblem(subject, stack, model, *args, inputs.views.rays_per_pixel)
 
         return with_affordable_rays(self, problem)

@@ -82,10 +82,12 @@ def _read_shot(frame: Frame, longest: int, white: int | None = None) -> tuple[Sh
         camera = Camera(torch.from_numpy(intrinsics), torch.from_numpy(frame.world_to_camera), size[1], size[0])
     except ValueError as error:
         raise BadInput(f"the camera of {frame.image}: {error}") from None
-    mask = None if opacity is None else torch.from_numpy(opacity[..., 0] > 0.5)
+    covered = None if opacity is None else torch.from_numpy(np.ascontiguousarray(opacity[..., 0]))
+    mask = None if covered is None else covered > 0.5
     if frame.depth is not None and depth is not None and mask is not None:
         check_object_depths(depth[mask & (depth > 0)].double().numpy(), frame.depth[0])
-    return Shot(frame.image.name, camera, torch.from_numpy(np.ascontiguousarray(colours)), mask, depth), missing
+    stored = torch.from_numpy(np.ascontiguousarray(colours))
+    return Shot(frame.image.name, camera, stored, mask, depth, covered=covered), missing
 
 
 def exif_notes(frames: Sequence[Frame]) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from renderers.fields.analytic import Shape, box, plane, sphere
 from tests.looped import each
 from tests.renderers.analytic_cases import sheet, vector
 from tests.solve.test_pixel_area import CAMERA, RADIUS, true_area
+from tests.tiny import camera_of
 
 EDGES, BAND = load("renderer", "edge_sampling"), load("renderer", "relaxed_boundary")
 SIDE, HALF = 24, 0.8
@@ -97,6 +98,18 @@ def test_several_rays_per_pixel_split_their_cells(count, error):
     assert (edges[:, 0] - 1).abs().max() < 0.005
     assert edges[:, 1].mean().item() == pytest.approx(1, rel=error)
     assert derivatives_of_area(BAND, count)[:, 1].std() > 5 * edges[:, 1].std() > 0
+
+
+def test_views_in_a_batch_are_split_as_alone():
+    cameras = [CAMERA, camera_of(24, angles=(40.0, 10.0))]
+    batch = pixel_area.random_rays_of(cameras, 4, 0, 0)
+    field = sphere(RADIUS) | sphere(0.2).translate((0.4, 0.3, 0.3))
+    alone = [EDGES.render(field, pixel_area.random_rays(camera, 4, k, 0)) for k, camera in enumerate(cameras)]
+    together = EDGES.render(field, batch)
+    assert torch.equal(together.hit, torch.stack([one.hit for one in alone]))
+    opacity = torch.stack([one.opacity for one in alone])
+    torch.testing.assert_close(together.opacity, opacity, rtol=0, atol=1e-5)
+    assert int(((opacity > 0.01) & (opacity < 0.99)).sum()) > 50
 
 
 @each("count", [2, 16])

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from bench.config import load
+from bench.solve import pixel_area
 from bench.solve.latent_code import Terms
 from bench.tasks.reconstruction.losses import CUBE_POINTS, NEIGHBOUR_CUBE_SIDE, Losses
 from bench.tasks.reconstruction.pixels import Pixels
@@ -15,7 +16,7 @@ from datasets.shot import Shot
 from renderers.camera import Camera, Rays
 from renderers.checks import BadInput
 from renderers.field import Coloured, Kind, Meter
-from renderers.silhouette import Own
+from renderers.silhouette import Area, Own
 from tests.looped import each
 from tests.renderers.analytic_cases import vector
 from tests.tiny import camera_of
@@ -123,6 +124,48 @@ def test_the_colour_term_is_the_sum_over_hits_on_the_foreground_over_all_rays(ma
     assert set(terms) == {"total", "colour"}
     assert terms["colour"].item() == pytest.approx(3.0 * expected / 64, rel=1e-9)
     assert torch.equal(terms["total"], terms["colour"])
+
+
+def several(count: int, **observed: Tensor) -> Pixels:
+    """All pixels of a camera with several rays, and the exact fractions of them that the ball covers."""
+    camera = CAMERA.double()
+    covered = BALL.distance(pixel_area.random_rays(camera, 256, 0, 0)).isfinite().double().mean(-1).flatten()
+    rays = pixel_area.random_rays(camera, count, 0, 0)
+    flat = Rays(rays.origins.flatten(0, 1), rays.directions.flatten(0, 1))
+    return replace(PIXELS, rays=flat, covered=covered, mask=covered > 0.5, **observed)
+
+
+@each("name", ["idr", "neus"])
+def test_the_colour_of_a_filled_pixel_is_the_mean_over_its_rays(name):
+    renderer, pixels = RENDERERS.get(name) or load("renderer", name), several(4)
+    distance = BALL.distance(pixels.rays)
+    points = pixels.rays.at(distance)
+    filled = pixels.covered == 1
+    mean = BALL.colours(points, BALL.normals(points), pixels.rays.directions).mean(1)
+    expected = (mean - pixels.colours)[filled].abs().sum() / 64
+    terms = losses(colour=1.0)(renderer, BALL, Meter(BALL), pixels)
+    tolerance = 1e-6 if name == "idr" else 0.05  # a volume blends colours along the ray
+    assert 10 < int(filled.sum()) < int(pixels.mask.sum())
+    assert terms["colour"].item() == pytest.approx(expected.item(), rel=tolerance)
+
+
+def test_fractions_of_pixels_are_compared_by_the_area_loss_and_by_losses_of_masks():
+    for silhouette, name in ((Area(1.0), "relaxed_boundary"), (Own(), "neus"), (Own(), "idr")):
+        settings, renderer = losses(silhouette=silhouette, silhouette_weight=1.0), load("renderer", name)
+        errors = [
+            settings(renderer, shape, Meter(shape), several(16))["silhouette"].item()
+            for shape in (ball(0.4), BALL, ball(0.8))
+        ]
+        assert errors[1] < 0.2 * min(errors[0], errors[2]), name
+
+
+def test_observations_of_single_rays_are_refused_with_several():
+    given = several(4, distance=DISTANCE, normals=torch.zeros(64, 3, dtype=torch.float64))
+    with pytest.raises(BadInput, match=r"set task\.losses\.depth=0 task\.losses\.normals=0"):
+        terms_of(losses(colour=1.0, depth=1.0, normals=1.0), BALL, given)
+    assert terms_of(losses(colour=1.0), BALL, given)["colour"] > 0
+    with pytest.raises(BadInput, match=r"set task\.losses\.colour_of=blended"):
+        losses(colour=1.0, colour_of="samples")(load("renderer", "neus"), BALL, Meter(BALL), several(4))
 
 
 @each("target", [0.0, 1.0, None])

@@ -1,6 +1,7 @@
 """The pixels of photographs of two sizes: drawn pixels, patches of neighbours, and their observations."""
 
 from dataclasses import replace
+from math import isqrt
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from bench.tasks.reconstruction.pixels import Stack
 from datasets.shot import Shot
 from renderers.camera import sphere_span
 from renderers.checks import BadInput
+from tests.looped import each
 from tests.tasks.reconstruction.test_losses import ball, shot_of
 from tests.tiny import CPU, camera_of
 
@@ -56,6 +58,24 @@ def test_patches_are_neighbours_in_one_photograph():
     for photograph, (height, width) in enumerate(SIZES):
         inside = drawn[drawn[:, 0, 0] == photograph]
         assert (inside[..., 1] < height).all() and (inside[..., 2] < width).all()
+
+
+@each("count", [4, 16])
+def test_several_rays_lie_in_the_cells_of_their_pixel_of_the_right_photograph(count):
+    shots, side = [replace(shot, covered=shot.mask.float()) for shot in SHOTS], isqrt(count)
+    stack = Stack.build(shots, None, CPU)
+    drawn = stack.draw(200, patches=False, seed=0)
+    pixels = stack.with_rays(drawn, count, torch.Generator().manual_seed(0))
+    assert pixels.several and not drawn.several and pixels.rays.shape == (200, count)
+    assert torch.equal(pixels.covered, drawn.mask.float())
+    for number, shot in enumerate(shots):
+        here = positions(pixels)[:, 0] == number
+        points = pixels.rays.at(torch.ones(200, count))[here]
+        inside = shot.camera.project(points)[0] - positions(pixels)[here][:, [2, 1]][:, None]
+        cells = (side * inside).floor().long()
+        expected = torch.cartesian_prod(torch.arange(side), torch.arange(side)).expand_as(cells)
+        assert (cells == expected).float().mean() > 0.999 and len(points) > 20
+    assert torch.equal(pixels.inside(torch.ones(200, count).bool()), drawn.mask[:, None].expand(-1, count))
 
 
 def test_only_rays_that_meet_the_unit_sphere_are_drawn_and_all_of_them():
