@@ -25,12 +25,12 @@ PROGRESS_INTERVAL_SECONDS = 0.05
 def main(record: Record, channel: Connection) -> None:
     """Makes the run of a record in the process of that run; its output goes to `log.txt`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes of a terminal; the parent passes it on
-    signal.signal(signal.SIGTERM, _stop)
     exit_with_parent()
     _redirect_output(record.folder / "log.txt")
     notices_to(lambda text: channel.send(Notice(text)))
     channel.send(Started())
     try:
+        signal.signal(signal.SIGTERM, _stop)  # until here it ends the process at once
         execute(record, channel.send)
     except KeyboardInterrupt:
         record.status = RunStatus.KILLED
