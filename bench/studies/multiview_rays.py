@@ -1,0 +1,53 @@
+"""Shape from many views with masks, at equal cost: losses of opacities and of masks, over rays per pixel."""
+
+from typing import Any
+
+import numpy as np
+
+from bench.report.study import Runs, Selection, condition_curves, statistics
+
+PLACE = 51
+RAYS = "view.rays_per_pixel"
+READS = (Selection("multiview_rays", (RAYS,)),)
+NOTES = (
+    "A prior's code is fitted, from a random code, to the colours and silhouettes of 12 photographs of 32 x 32 pixels. "
+    "With 4 rays, colours are compared in pixels of which the neighbouring photograph sees the points of all rays.",
+    "All runs have the same budget of field evaluations. Each iteration draws as many pixels as the budget affords for "
+    "40 iterations, so 4 rays per pixel mean fewer pixels or fewer iterations.",
+    "Rows with area in their name compare a pixel's mean opacity with the fraction of it that the shape covers. The "
+    "others have DIST's loss, which compares single rays with a mask, for all renderers.",
+    "The weight of each of the two losses was chosen on four validation shapes, for the relaxed boundary and NeuS.",
+    "A run that is not ok counts with its result, if it has one. With `not_reached`, its loss did not fall.",
+)
+
+
+def notes(runs: Runs) -> list[str]:
+    """The notes, with the ratio of each renderer's area loss with 4 rays to its mask loss with 1."""
+    rays, errors = runs.number(f"config.{RAYS}").fillna(1), runs.number("chamfer_l1").fillna(np.inf)
+    frame = runs.frame.assign(rays=rays, error=errors).set_index(condition_curves.SHAPE).sort_index()
+    errors_of = {key: group["error"] for key, group in frame.groupby(["preset", "rays"])}
+    names: dict[Any, str] = dict(zip(frame["preset"], frame["row"], strict=True))
+    pairs = {name: ((preset, 4), (preset.replace("area", "mask"), 1)) for preset, name in names.items()}
+    ratios = [
+        f"{name}, {statistics.common_ratio(errors_of[area], errors_of[mask])}"
+        for name, (area, mask) in pairs.items()
+        if area[0] != mask[0] and {area, mask} <= {*errors_of}
+    ]
+    compared = f"Area loss with 4 rays over the mask loss with 1, not tested: {'; '.join(ratios)}."
+    return [*NOTES, *([compared] if ratios else [])]
+
+
+PAGES = {
+    "multiview_rays": condition_curves.ConditionCurves(
+        condition=RAYS,
+        heading="Rays per pixel",
+        first=1,
+        absent=1,
+        compared=4,
+        measures=(condition_curves.Measure("chamfer_l1", "Chamfer-L1 × 1000", 1e3),),
+        title="Many views by rays per pixel.",
+        question="At equal cost, do several rays per pixel lower the error of a shape from many views?",
+        verdict="Chamfer-L1 with 4 rays per pixel over that with 1, at equal cost",
+        notes=notes,
+    )
+}
