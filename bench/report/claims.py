@@ -92,7 +92,7 @@ def page(
         n=f"{sum(line['shapes'] is not None for line in lines)} measured claims; the table has the shapes of each",
         interval=compare.INTERVAL,
         remarks=notes,
-        columns=COLUMNS,
+        columns=[column for column in COLUMNS if column.key != "published" or any(line["published"] for line in lines)],
         lines=lines,
     )
 

@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.report.study import Runs, Selection, condition_curves, statistics
+from bench.report.study import NO_TIMES, Runs, Selection, condition_curves, statistics
 
 PLACE = 51
 RAYS = "view.rays_per_pixel"
-READS = (Selection("multiview_rays", (RAYS,)),)
+READS = (Selection("multiview_rays", (RAYS,), setup=NO_TIMES),)
 NOTES = (
     "A prior's code is fitted, from a random code, to the colours and silhouettes of 12 photographs of 32 x 32 pixels. "
     "With 4 rays, colours are compared in pixels of which the neighbouring photograph sees the points of all rays.",

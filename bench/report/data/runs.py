@@ -47,6 +47,9 @@ MEASUREMENT_METRICS = {  # for tasks that measure without optimising
 ROW_SECTIONS = ("renderer", "task", "silhouette", "field")  # settings in which rows of equal names may differ
 
 
+NO_TIMES = ("scenes", "pixels", "network")  # the `setup` of pages without runtimes, which need no machine
+
+
 @dataclass(frozen=True)
 class Selection:
     """The runs that a study reads.
@@ -62,7 +65,7 @@ class Selection:
 
     experiment: str
     conditions: tuple[str, ...] = ()
-    setup: tuple[str, ...] = ("scenes", "pixels", "network", "machine")
+    setup: tuple[str, ...] = (*NO_TIMES, "machine")
     alike: tuple[str, ...] = ()
     must_agree: tuple[str, ...] = ()
     may_differ: tuple[str, ...] = ()
