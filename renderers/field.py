@@ -324,6 +324,30 @@ def values_and_gradients(
     return value.detach(), gradient
 
 
+def gradients_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """The field's gradients at points, differentiable in its parameters and the points.
+
+    They are central differences over the field's `slope_width` if that is not 0.
+    """
+    if width := getattr(field.inner if isinstance(field, Meter) else field, "slope_width", 0.0):
+        return central_differences(field, points, width)
+    points = points if points.requires_grad else points.detach().requires_grad_(True)
+    with torch.enable_grad():  # also if the caller needs the loss alone
+        return torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
+
+
+def central_differences(field: Field, points: Float[Tensor, "n 3"], width: float) -> Float[Tensor, "n 3"]:
+    """The field's gradients at points, by central differences over `width`.
+
+    The gradient of a ReLU network at a point is the same for all codes that open the same ReLUs, so it has no
+    derivative in the code. These differences have one, by the ReLUs between the two points.
+    """
+    moves = width / 2 * torch.eye(3, dtype=points.dtype, device=points.device)
+    neighbours = points[:, None, None] + torch.stack([moves, -moves])
+    ahead, behind = field(neighbours).unbind(dim=1)
+    return (ahead - behind) / width
+
+
 def estimate_lipschitz(field: Field, *, radius: float, samples: int = 20_000, like: Tensor | None = None) -> float:
     """Estimates the field's Lipschitz constant: the longest gradient at points in the sphere, with a safety factor.
 

@@ -13,7 +13,7 @@ from bench.setup.inputs import RunInputs
 from datasets.mesh import Mesh
 from datasets.scene import Truth, View
 from renderers.camera import Camera
-from renderers.field import Coloured, autograd_gradients
+from renderers.field import Coloured, Counts, gradients_at
 
 DEFAULT_VERTEX_COLOUR = 0.5
 POINTS_PER_BATCH = 16_384
@@ -33,9 +33,15 @@ def colours_in_view(state: State, view: View) -> Float[Tensor, "height width 3"]
     return coloured_image(state.field, view, state.inputs.device) if isinstance(state.field, Coloured) else None
 
 
-def render_image(field: Coloured, camera: Camera, inputs: RunInputs) -> tuple[View, Float[Tensor, "height width 3"]]:
-    """The hits of the run's renderer from a camera, and their colours or a volume's weighted sums."""
-    rendering, view = render_with_view(field, camera, inputs)
+def render_image(
+    field: Coloured, camera: Camera, inputs: RunInputs, counts: Counts | None = None
+) -> tuple[View, Float[Tensor, "height width 3"]]:
+    """The hits of the run's renderer from a camera, and their colours or a volume's weighted sums.
+
+    Args:
+        counts: see `render_with_view`.
+    """
+    rendering, view = render_with_view(field, camera, inputs, counts)
     volume = rendering.volume
     if volume is None:
         return view, coloured_image(field, view, inputs.device)
@@ -74,7 +80,7 @@ def colours_at(
     colours = [points.new_zeros(0, 3)]
     for start in range(0, len(points), POINTS_PER_BATCH):
         chunk = points[start : start + POINTS_PER_BATCH].to(device)
-        gradients = autograd_gradients(field, chunk)
+        gradients = gradients_at(field, chunk).detach()
         inwards = -torch.nn.functional.normalize(gradients, dim=-1)
         view_directions = inwards if directions is None else directions[start : start + POINTS_PER_BATCH].to(device)
         with torch.no_grad():

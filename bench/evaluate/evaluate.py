@@ -20,7 +20,7 @@ from datasets.scene import Surface, View, sample_surface
 from datasets.shot import mask_iou
 from renderers.boundary import render_checked
 from renderers.camera import Camera
-from renderers.field import Coloured, Field, autograd_normals
+from renderers.field import Coloured, Counts, Field, Meter, autograd_normals
 from renderers.rendering import Rendering
 
 OWN_PREFIX = "own_"  # begins names of metrics of the image by the renderer under test
@@ -210,10 +210,17 @@ def render_view(field: Field, camera: Camera, inputs: RunInputs) -> View:
     return render_with_view(field, camera, inputs)[1]
 
 
-def render_with_view(field: Field, camera: Camera, inputs: RunInputs) -> tuple[Rendering, View]:
-    """The run's rendering of a field, without gradients, and its hits as a View on the CPU."""
+def render_with_view(
+    field: Field, camera: Camera, inputs: RunInputs, counts: Counts | None = None
+) -> tuple[Rendering, View]:
+    """The run's rendering of a field, without gradients, and its hits as a View on the CPU.
+
+    Args:
+        counts: are added to by the renderer's evaluations of the field.
+    """
+    counted = field if counts is None else Meter(field, counts)
     with torch.no_grad():
-        rendering = render_checked(inputs.renderer, field, camera.rays().to(inputs.device))
+        rendering = render_checked(inputs.renderer, counted, camera.rays().to(inputs.device))
     normals = torch.zeros_like(rendering.points)
     normals[rendering.hit] = autograd_normals(field, rendering.points[rendering.hit])
     depth = camera.depth(rendering.distance.cpu()) * rendering.hit.cpu()

@@ -15,7 +15,7 @@ from bench.solve.pixel_draw import PixelDraw
 from datasets.scene import Scene, View, see_area
 from renderers.boundary import render_checked
 from renderers.camera import Camera, Rays
-from renderers.field import Field, Meter
+from renderers.field import Field, Meter, central_differences
 from renderers.rendering import RayObservation, Renderer, Rendering, at_iteration
 from renderers.silhouette import SilhouetteLoss
 
@@ -36,25 +36,6 @@ def normal_error(predicted: Float[Tensor, "n 3"], observed: Float[Tensor, "n 3"]
     has_normal = observed.square().sum(-1) > 0
     cosine = (predicted * observed).sum(-1)[has_normal]
     return (1 - cosine).sum() / has_normal.sum().clamp_min(1)
-
-
-def gradients_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """The field's gradients at points, differentiable in its parameters and the points."""
-    points = points if points.requires_grad else points.detach().requires_grad_(True)
-    with torch.enable_grad():  # also if the caller needs the loss alone
-        return torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
-
-
-def central_differences(field: Field, points: Float[Tensor, "n 3"], width: float) -> Float[Tensor, "n 3"]:
-    """The field's gradients at points, by central differences over `width`.
-
-    The gradient of a ReLU network at a point is the same for all codes that open the same ReLUs, so it has no
-    derivative in the code. These differences have one, by the ReLUs between the two points.
-    """
-    moves = width / 2 * torch.eye(3, dtype=points.dtype, device=points.device)
-    neighbours = points[:, None, None] + torch.stack([moves, -moves])
-    ahead, behind = field(neighbours).unbind(dim=1)
-    return (ahead - behind) / width
 
 
 def expected_in_draw(observed: Bool[Tensor, "*rays"], count: int) -> float:

@@ -6,7 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from renderers.field import autograd_gradients
+from bench.evaluate.colours import colours_at
+from renderers.field import Meter, autograd_gradients, gradients_at
+from renderers.fields.networks.coloured import ColouredEncoded
 from renderers.fields.networks.encoded import EncodedNetwork, FourierFeatures, HashGrid
 
 DRAW = torch.Generator().manual_seed(3)
@@ -57,3 +59,21 @@ def test_slopes_are_those_of_central_differences(name):
     assert (off < 1e-4).double().mean() > 0.98  # except within a step of a cell's side or of a ReLU's bend
     with torch.no_grad():
         torch.testing.assert_close(field(POINTS.view(10, 20, 3)), field(POINTS).view(10, 20))
+
+
+def test_the_slopes_of_a_width_are_counted_differences_in_losses_and_for_colours():
+    model = ColouredEncoded(
+        HashGrid(0.1 * torch.randn(2, 64, 2, generator=torch.Generator().manual_seed(0)), (3, 7), 1.05),
+        layers=1, width=8, radius=0.5, directional=False, slope_width=0.1,
+    )  # fmt: skip
+    with torch.no_grad():
+        model.distance[0].weight.normal_(generator=torch.Generator().manual_seed(1))
+    points, metered = POINTS.float(), Meter(model)
+    slopes = gradients_at(metered, points)
+    moved = [[model(points + sign * 0.05 * axis) for sign in (1, -1)] for axis in torch.eye(3)]
+    expected = torch.stack([(ahead - behind) / 0.1 for ahead, behind in moved], dim=-1)
+    torch.testing.assert_close(slopes, expected)
+    assert metered.counts.value == 6 * len(points)
+    assert (slopes - autograd_gradients(model, points)).abs().max() > 0.01
+    seen = model.colours(points, expected, points)
+    torch.testing.assert_close(colours_at(model, points, points, torch.device("cpu")), seen.detach())

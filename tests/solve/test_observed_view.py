@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from bench.config import load
-from bench.solve.observed_view import ObservedView, central_differences, gradients_at, normal_error, observed_hits
+from bench.solve.observed_view import ObservedView, normal_error, observed_hits
 from bench.tasks.capacity.observations import concatenate_views
 from datasets.scene import View
+from renderers.field import central_differences, gradients_at
 from renderers.fields.analytic import Shape, sphere
 from renderers.fields.mlp import Decoder
 from renderers.silhouette import Own

@@ -13,14 +13,13 @@ from torch import Tensor
 from bench.records.record import RunStatus
 from bench.shape_prior import near_surface_first
 from bench.solve.latent_code import Terms, total
-from bench.solve.observed_view import gradients_at
 from bench.solve.optimise import CannotContinue, History, OptimiserSettings, optimise
 from bench.solve.pixel_draw import generator_of
 from bench.tasks.capacity.candidates import primitive_candidate
 from bench.tasks.capacity.model import Candidate, Evidence, Model, StartInputs
 from bench.tasks.capacity.observations import RayObservations
 from bench.tasks.capacity.settings import FitSettings, rays_share
-from renderers.field import Counts, Field, Meter
+from renderers.field import Counts, Field, Meter, gradients_at
 from renderers.rendering import Renderer, Unsupported, check_kind, with_empty_memory
 
 EIKONAL_POINTS = 512

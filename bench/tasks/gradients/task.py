@@ -11,7 +11,6 @@ from torch import Tensor
 from bench.evaluate.reference import RADIUS, Reference, in_float64, reference_for
 from bench.records.record import RunStatus
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.observed_view import gradients_at
 from bench.solve.solve import check_field_gradient
 from bench.tasks.gradients.finite_differences import (
     Paint,
@@ -25,7 +24,7 @@ from bench.tasks.gradients.finite_differences import (
 from renderers.boundary import check_gradients, render_checked
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import check_at_least, check_positive
-from renderers.field import Counts, Field, Meter, estimate_lipschitz
+from renderers.field import Counts, Field, Meter, estimate_lipschitz, gradients_at
 from renderers.fields.mlp import Decoder
 from renderers.rendering import Blurred, Renderer, Rendering, check_kind
 

@@ -51,15 +51,18 @@ class Appearance:
         octaves: octaves of a distance network's positional encoding.
         directional: whether colours of a distance network depend on the view direction.
         radius: radius of the initial sphere, in scene units.
+        slope_width: see `renderers.fields.networks.coloured.ColouredEncoded`.
     """
 
     octaves: int
     directional: bool
     radius: float
+    slope_width: float = 0.0
 
     def __post_init__(self) -> None:
         check_at_least("task.appearance.octaves", self.octaves, 0, "5 follow details of a pixel at 128 x 128")
         check_positive("task.appearance.radius", self.radius, "0.5 lies within most objects")
+        check_at_least("task.appearance.slope_width", self.slope_width, 0, "0.04 is a cell of the finest grid")
 
     def make(self, name: str) -> Learnt:
         """Builds the initial field of a name.
@@ -68,6 +71,10 @@ class Appearance:
             BadInput: for the name of a field without colours.
         """
         kind, sizes = (name, ()) if name in (PRIOR_FIELD, AUTO) else parse_field_name(name)
+        if self.slope_width and kind not in ("hash", "fourier"):
+            raise BadInput(
+                f"field={name} has exact slopes: remove task.appearance.slope_width, or take field=hash_8x12"
+            )
         if kind == "network":
             layers, width = sizes
             shape = {"layers": layers, "width": width, "octaves": self.octaves}
@@ -78,9 +85,8 @@ class Appearance:
             hashed = kind == "hash"
             encoding = initial_hash_grid(*sizes) if hashed else initial_fourier(sizes[1] // 2)
             layers, width = (1, HASH_WIDTH) if hashed else sizes
-            return ColouredEncoded(
-                encoding, layers=layers, width=width, radius=self.radius, directional=self.directional
-            )
+            common = {"radius": self.radius, "directional": self.directional, "slope_width": self.slope_width}
+            return ColouredEncoded(encoding, layers=layers, width=width, **common)
         if kind == "grid":
             return ColouredGrid(samples=sizes[0], radius=self.radius, reach=REACH)
         raise BadInput(f"field={name} has no colours: {FORMS}")

@@ -36,10 +36,11 @@ from datasets.mesh import Mesh
 from datasets.scene import View, sample_surface
 from datasets.shot import Shot, mask_iou
 from renderers.camera import sphere_span
-from renderers.field import Field
+from renderers.field import Counts, Field
 
 SEEN_PREFIX = "seen_"  # marks metrics over the points of both surfaces that are visible in an input photograph
 SURFACE_METRICS = tuple(WORST_SURFACE)
+RENDERING_COST = "rendering_evaluations"
 IMAGE_SCORES = {
     "psnr": "Peak signal-to-noise ratio over the pixels of a held-out photograph's mask, black where the shape is not"
     " seen, mean over photographs, in decibels, as IDR and NeuS define it. Without masks: over the pixels whose rays"
@@ -67,6 +68,8 @@ COLOURED_DEFINITIONS = {
         for name, text in IMAGE_SCORES.items()
     },
     **WEIGHT,
+    RENDERING_COST: "Field evaluations per ray of the renderer under test, over all pixels of the held-out photographs,"
+    " without those of gradients and colours.",
 }
 
 
@@ -75,7 +78,9 @@ def judge(state: State, subject: Subject) -> Evaluation:
     field, inputs, shots = state.field, state.inputs, subject.held_out
     metrics = surface_scores(state.mesh, subject, inputs) | field_scores(state, shots)
     metrics |= early_weight(field, [state.view_from(shot.camera) for shot in shots], inputs)
-    renderings = [render_image(field, shot.camera, inputs) for shot in shots]
+    counts, rays = Counts(), sum(shot.colours[..., 0].numel() for shot in shots)
+    renderings = [render_image(field, shot.camera, inputs, counts) for shot in shots]
+    metrics[RENDERING_COST] = counts.value / rays
     views = [view for view, _ in renderings]
     scores = image_scores(views, [image for _, image in renderings], shots)
     metrics |= {OWN_PREFIX + name: value for name, value in scores.items()}

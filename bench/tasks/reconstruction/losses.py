@@ -7,14 +7,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bench.solve.latent_code import Terms, total
-from bench.solve.observed_view import DEPTH_LOSSES, depth_error, gradients_at, normal_error
+from bench.solve.observed_view import DEPTH_LOSSES, depth_error, normal_error
 from bench.solve.pixel_area import observation_of
 from bench.tasks.reconstruction.background import Background
 from bench.tasks.reconstruction.pixels import Pixels
 from renderers.boundary import render_checked
 from renderers.camera import Rays
 from renderers.checks import BadInput, check_at_least, check_choice, check_positive
-from renderers.field import Coloured, Field, Kind, Meter
+from renderers.field import Coloured, Field, Kind, Meter, gradients_at
 from renderers.rendering import RayObservation, Renderer, Rendering, Volume
 from renderers.silhouette import SilhouetteLoss
 

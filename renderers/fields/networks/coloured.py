@@ -133,18 +133,27 @@ class ColouredEncoded(nn.Module):
         width: neurons per hidden layer; the colour network has two hidden layers.
         radius: of the initial sphere, in scene units.
         directional: whether colours depend on the view direction.
+        slope_width: of central differences, in scene units, as gradients in losses and for colours (Neuralangelo, Li et
+            al. 2023, Sec. 3.2; there it falls from a coarse to a fine grid's cell); 0: automatic differentiation.
     """
 
     kind: ClassVar[Kind] = Kind.DISTANCE
     lipschitz: ClassVar[None] = None
 
     def __init__(
-        self, encoding: HashGrid | FourierFeatures, *, layers: int, width: int, radius: float, directional: bool
+        self,
+        encoding: HashGrid | FourierFeatures,
+        *,
+        layers: int,
+        width: int,
+        radius: float,
+        directional: bool,
+        slope_width: float = 0.0,
     ) -> None:
         super().__init__()
         check_at_least("layers", layers, 1, "1 suits a hash grid, 4 suit Fourier features")
         check_positive("radius", radius, "0.5 lies within most objects")
-        self.directional = directional
+        self.directional, self.slope_width = directional, slope_width
         if isinstance(encoding, HashGrid):
             self.cells, self.reach = encoding.cells, encoding.reach
             self.tables = nn.Parameter(encoding.tables)

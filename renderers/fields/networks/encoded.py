@@ -1,7 +1,7 @@
 """Networks of encoded points: Fourier features, and a hash grid of several resolutions, as distances of one shape.
 
-Their slopes are those of autograd. The slope of a hash grid jumps between its cells, and depends on one cell of each
-level. Neuralangelo (Li et al. 2023) takes central differences instead, which reach neighbouring cells.
+The slope of a hash grid jumps between its cells, and depends on one cell of each level. Neuralangelo (Li et al. 2023)
+takes central differences instead, which reach neighbouring cells: see `slope_width` of `coloured.ColouredEncoded`.
 """
 
 from dataclasses import dataclass

@@ -27,6 +27,7 @@ from datasets.scene import Surface, Truth, View, sample_surface, see
 from datasets.shot import Shot
 from renderers.boundary import render_checked
 from renderers.camera import sphere_span
+from renderers.field import Meter
 from tests.tasks.reconstruction.test_losses import Ball, ball, cast, shot_of
 from tests.tiny import ball_prior, camera_of, icosphere, run_of
 
@@ -65,6 +66,11 @@ def test_the_truth_scores_high(subject, inputs):
     assert metrics["chamfer_l1"] < 0.03 and metrics["seen_chamfer_l1"] < 0.03
     assert metrics["normal_consistency"] > 0.99 and metrics["fscore"] > 0.4
     assert evaluation.mesh is not None and evaluation.mesh.colours is not None
+    with torch.no_grad():
+        metered = Meter(painted())
+        rays = [shot.camera.rays() for shot in subject.held_out]
+        hits = sum(int(inputs.renderer.render(metered, each_view).hit.sum()) for each_view in rays)
+    assert metrics["rendering_evaluations"] == metered.counts.value / (2 * 24**2) > 2 * hits / (2 * 24**2)
 
 
 def test_vertices_have_the_fields_colours_seen_from_straight_above(subject, inputs):
