@@ -36,11 +36,7 @@ def colours_in_view(state: State, view: View) -> Float[Tensor, "height width 3"]
 def render_image(
     field: Coloured, camera: Camera, inputs: RunInputs, counts: Counts | None = None
 ) -> tuple[View, Float[Tensor, "height width 3"]]:
-    """The hits of the run's renderer from a camera, and their colours or a volume's weighted sums.
-
-    Args:
-        counts: see `render_with_view`.
-    """
+    """See `render_with_view`: the hits, and their colours or a volume's weighted sums."""
     rendering, view = render_with_view(field, camera, inputs, counts)
     volume = rendering.volume
     if volume is None:

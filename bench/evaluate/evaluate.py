@@ -215,8 +215,7 @@ def render_with_view(
 ) -> tuple[Rendering, View]:
     """The run's rendering of a field, without gradients, and its hits as a View on the CPU.
 
-    Args:
-        counts: are added to by the renderer's evaluations of the field.
+    The renderer's evaluations of the field are added to `counts`.
     """
     counted = field if counts is None else Meter(field, counts)
     with torch.no_grad():

@@ -276,10 +276,8 @@ class PhotometricLoss:
         renderer, images = at_iteration(self.renderer, iteration), self.images_at(iteration)
         views, neighbours = map(list, zip(*self.pairs(iteration), strict=True))
         rays, observed = self._stack_rays(views), images[views]
-        several = self.rays_per_pixel > 1
-        if several:
-            cameras = [self.cameras[view] for view in views]
-            rays = random_rays_of(cameras, self.rays_per_pixel, self.seed, iteration)
+        if several := self.rays_per_pixel > 1:
+            rays = random_rays_of([self.cameras[view] for view in views], self.rays_per_pixel, self.seed, iteration)
         is_drawn = drawn is not None
         if is_drawn:
             drawn = drawn.to(self.colours.device)
