@@ -1,13 +1,13 @@
 """Colour images of a textured mesh from several cameras, with noise, blur and exposure of a real camera."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 
-from datasets.scene import Truth, see, see_area
+from datasets.scene import Truth, see
 from datasets.shot import Shot
 from datasets.textures import ONE_COLOUR, TEXTURES, Texture, make_texture
 from datasets.views import look_at
@@ -111,11 +111,6 @@ class Photography:
         image = image + self.noise * generator.standard_normal(image.shape)
         colours, view = torch.from_numpy(image.clip(0, 1).astype(np.float32)), see(truth, camera)
         return Shot(name, camera, colours, view.mask, view.depth, view.normals)
-
-
-def with_areas(shots: Sequence[Shot], truth: Truth) -> list[Shot]:
-    """Photographs of a mesh with the fraction of each pixel that it covers."""
-    return [replace(shot, covered=see_area(truth, shot.camera)[0]) for shot in shots]
 
 
 def _colour_spread(shot: Shot) -> float:

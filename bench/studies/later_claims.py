@@ -32,7 +32,7 @@ CLAIMS = (
     ),
     Claim(
         "HotSpot", "a march needs fewer evaluations on a field that was learnt with the heat loss", None, EXPERIMENT,
-        "later_idr_heat", "later_idr", "rendering_evaluations", why=UNDECIDED,
+        "later_idr_heat", "later_idr", "own_evaluations", why=UNDECIDED,
     ),
     Claim(
         "Coiffier 2024", "no march overshoots on a 1-Lipschitz network",

@@ -11,12 +11,17 @@ RAYS = "view.rays_per_pixel"
 READS = (Selection("multiview_rays", (RAYS,), setup=NO_TIMES),)
 NOTES = (
     "A prior's code is fitted, from a random code, to the colours and silhouettes of 12 photographs of 32 x 32 pixels. "
-    "With 4 rays, colours are compared in pixels of which the neighbouring photograph sees the points of all rays.",
-    "All runs have the same budget of field evaluations. Each iteration draws as many pixels as the budget affords for "
-    "40 iterations, so 4 rays per pixel mean fewer pixels or fewer iterations.",
+    "With 4 rays, the mean colour of a pixel is compared, if all of its rays hit and the neighbouring photograph sees "
+    "at least two of their points.",
+    "All runs have the same budget of field evaluations. An iteration draws a pixel of each block of 1, 2, 4 or 8 "
+    "pixels per side: the smallest block with which the budget pays for 40 iterations. With 4 rays blocks are larger, "
+    "so an iteration compares fewer pixels, and a run may have more iterations.",
+    "With 1 ray, the observation of a pixel is its mask at the centre. With 4, it is the fraction that the shape "
+    "covers. So a ratio also contains the change of the observation.",
     "Rows with area in their name compare a pixel's mean opacity with the fraction of it that the shape covers. The "
     "others have DIST's loss, which compares single rays with a mask, for all renderers.",
-    "The weight of each of the two losses was chosen on four validation shapes, for the relaxed boundary and NeuS.",
+    "The weights of the two losses were chosen on four validation shapes, for the relaxed boundary and NeuS: of 1, 10, "
+    "100 and 1000 for areas with 4 rays, and of 1, 10 and 100 for masks with 1 ray.",
     "A run that is not ok counts with its result, if it has one. With `not_reached`, its loss did not fall.",
 )
 

@@ -1,7 +1,7 @@
 """Shape from many views: optimises the code for photometric consistency between views (DIST, Sec. 4.2.2)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -16,8 +16,8 @@ from bench.solve.optimise import CannotContinue, OptimiserSettings, StartSetting
 from bench.solve.pixel_area import observation_of, random_rays_of
 from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import check_field_gradient, metric_definitions, solve_and_draw
-from datasets.photographs import Photography, with_areas
-from datasets.scene import Scene
+from datasets.photographs import Photography
+from datasets.scene import Scene, see_area
 from datasets.shot import Shot
 from renderers.boundary import render_checked
 from renderers.camera import Rays, stacked
@@ -165,8 +165,8 @@ class Multiview:
         generator = torch.Generator().manual_seed(scene_seed)
         photographs = self.images.take(scene.raycaster, scene.view.camera.zoomed(self.focal), seed=scene_seed)
         rays = scene.rays_per_pixel
-        if rays > 1:
-            photographs = with_areas(photographs, scene.raycaster)
+        if rays > 1 and self.silhouette_weight:
+            photographs = [replace(shot, covered=see_area(scene.raycaster, shot.camera)[0]) for shot in photographs]
         loss = PhotometricLoss(self, renderer, photographs, device, seed=scene_seed, rays_per_pixel=rays)
         return self.problem_of(prior, loss, generator)
 
@@ -206,8 +206,8 @@ class Multiview:
 class PhotometricLoss:
     """Compares photographs: `compare` renders a field's depths and warps the photographs by them.
 
-    With several rays per pixel, a pixel is compared if the neighbour sees the points of all of its rays, by the mean of
-    their colours in the neighbour. The silhouette loss then compares fractions of pixels; see `bench.solve.pixel_area`.
+    With several rays per pixel, a pixel is compared if all of them hit, and the neighbour sees half of the points, by
+    the mean of their colours there. The silhouette loss compares fractions of pixels; see `bench.solve.pixel_area`.
     """
 
     def __init__(
@@ -287,11 +287,14 @@ class PhotometricLoss:
         visible = self._visible(renderer, field, rendering, neighbours, is_drawn)
         differences = []
         for k, other in enumerate(neighbours):
-            shown = visible[k].all(-1) if several else visible[k]
-            pixels, _ = self.cameras[other].project(rendering.points[k][shown])
-            warped, inside = sample(images[other], pixels)
+            shown = compared = visible[k]
             if several:
-                warped, inside = warped.mean(1), inside.all(1)
+                shown = rendering.hit[k].all(-1) & (2 * visible[k].sum(-1) >= self.rays_per_pixel)
+                compared = visible[k] & shown[..., None]
+            pixels, _ = self.cameras[other].project(rendering.points[k][compared])
+            warped, inside = sample(images[other], pixels)
+            if several:  # the neighbour sees these points, so they are inside
+                warped, inside = torch.segment_reduce(warped, "mean", lengths=compared[shown].sum(-1)), slice(None)
             differences.append((warped - observed[k][shown])[inside].abs().mean(-1))
         errors = torch.cat(differences)
         if not len(errors) and not is_drawn:

@@ -190,7 +190,7 @@ def _capture(layout: Layout, settings: ReadSettings) -> Capture:
     frames, origin = _centre(layout.frames, AXES[settings.axes])
     shots, depth_notes = read_shots(frames, settings.longest)
     masked = settings.masks and _all_masked(shots)
-    shots = shots if masked else [replace(shot, mask=None) for shot in shots]
+    shots = shots if masked else [replace(shot, mask=None, covered=None) for shot in shots]
     used = [i for i in range(len(shots)) if settings.held_out is None or i % settings.held_out]
     exif = exif_notes(frames)
     try:

@@ -95,14 +95,42 @@ def test_several_rays_per_pixel_compare_fractions_and_the_truth_costs_least(scen
         replace(scene, rays_per_pixel=rays), PRIOR, load("renderer", name), seed=0, device=CPU
     )
     assert problem.rays_per_iteration == (rays + 1) * 4 * (16 // block) ** 2
-    terms = [problem.compare(sphere(radius), 1) for radius in (0.4, 0.5, 0.6)]
+    draws = range(1, 1 + len(problem.photographs))
+    terms = [[problem.compare(sphere(radius), draw) for draw in draws] for radius in (0.4, 0.5, 0.6)]
     for term in ("photometric", "silhouette"):
-        costs = [each_term[term].item() for each_term in terms]
+        costs = [sum(of_draw[term].item() for of_draw in of_radius) for of_radius in terms]
         assert costs[1] < 0.7 * min(costs[0], costs[2]), (term, costs)
     radius = torch.tensor(0.4, requires_grad=True)
     (slope,) = torch.autograd.grad(problem.compare(sphere(radius), 1)["silhouette"], radius)
-    if (rays, block) == (4, 1) or name == "dist":
+    if rays == 4 or name == "dist":
         assert slope < 0  # a larger sphere covers more
+    later = problem.compare(sphere(0.5), 1 + len(problem.photographs))["photometric"]  # of the same views
+    assert (rays == 1 and block == 1) == (later.item() == terms[1][0]["photometric"].item())
+
+
+def test_a_pixel_is_compared_if_all_its_rays_hit_and_half_are_seen(scene, monkeypatch):
+    """By the mean over the seen rays; all images show their columns, which are interpolated exactly."""
+    photographs = SETTINGS.images.take(Truth(scene.mesh), CAMERA, seed=0)
+    loss = PhotometricLoss(SETTINGS, RENDERER, photographs, CPU, rays_per_pixel=4)
+    visible, columns, errors = loss._visible, torch.arange(16.0).expand(16, 16), []
+
+    def partly_visible(renderer, field, rendering, neighbours, is_drawn):
+        draw = torch.Generator().manual_seed(1)
+        keep = visible(renderer, field, rendering, neighbours, is_drawn) & (
+            torch.rand(4, 16, 16, 4, generator=draw) < 0.6
+        )
+        for k, other in enumerate(neighbours):
+            shown = rendering.hit[k].all(-1) & (keep[k].sum(-1) >= 2)
+            at = loss.cameras[other].project(rendering.points[k])[0][..., 0] - 0.5
+            mean = (at * keep[k]).sum(-1) / keep[k].sum(-1)
+            errors.append((mean - columns)[shown].abs())
+        return keep
+
+    monkeypatch.setattr(loss, "_visible", partly_visible)
+    monkeypatch.setattr(loss, "images_at", lambda _: columns[..., None].expand(len(photographs), 16, 16, 3))
+    compared = loss.compare(sphere(0.5), 0)["photometric"].item() / SETTINGS.photometric_weight
+    assert len(torch.cat(errors)) > 20
+    assert compared == pytest.approx(torch.cat(errors).mean().item(), rel=1e-4)
 
 
 def test_a_draw_that_both_views_see_nowhere_is_no_failure(scene):

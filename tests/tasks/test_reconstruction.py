@@ -4,11 +4,13 @@ import json
 import math
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 from bench.config import load
 from bench.setup.inputs import FieldChoice, RunContext
@@ -25,6 +27,7 @@ from datasets.files.meshes import read_mesh
 from datasets.files.own_photographs import OwnPhotographs
 from datasets.mesh import Mesh
 from datasets.scene import Scene, sample_surface
+from datasets.views import ViewSampler
 from renderers.checks import BadInput
 from renderers.rendering import Unsupported
 from renderers.silhouette import Own
@@ -277,6 +280,35 @@ def test_the_block_of_pixels_divides_the_rays(scene, tmp_path):
     short = replace(SETTINGS.optimiser, budget=2e4)
     sampled = replace(SETTINGS, pixel_block=0, optimiser=short).problem("network_2x16", subject, run)
     assert sampled.rays_per_iteration in (4, 12, 48) and sampled.counts.cost == 0
+
+
+@each("masks", [255, 250, None])
+def test_several_rays_of_each_pixel_are_drawn_anew_and_compared_with_fractions(scene, tmp_path, masks):
+    """Of a scene, and of photographs on disk, also if the white of their masks is darker."""
+    views = ViewSampler(2.5, 50.0, (0.0, 0.0), (0.0, 0.0), 24, rays_per_pixel=4)
+    run = run_in(tmp_path, scene if masks is None else None, field="network_2x16", views=views)
+    if masks == 250:
+        for file in tmp_path.rglob("*.png"):
+            image = np.array(Image.open(file))
+            image[..., 3] = image[..., 3] * (masks / 255)
+            Image.fromarray(image).save(file)
+    subject = SETTINGS.subject(run.inputs)
+    problem = replace(SETTINGS, camera_noise=2.0, cameras="refine", blur_points=0.01).problem(
+        "network_2x16", subject, run
+    )
+    seen, render = [], problem.renderer.render
+    recording = SimpleNamespace(render=lambda field, rays: seen.append(rays) or render(field, rays))
+    recording.capabilities, recording.silhouette_loss = problem.renderer.capabilities, problem.renderer.silhouette_loss
+    problem.renderer = recording
+    terms = problem.loss(1)
+    problem.loss(2)
+    assert problem.rays_per_iteration == 4 * 192
+    assert [tuple(rays.shape) for rays in seen] == [(192, 4)] * 2
+    assert (seen[0].directions[:, :1] - seen[0].directions[:, 1:]).abs().amax(-1).min() > 0
+    assert not torch.equal(seen[0].directions, seen[1].directions)
+    covered = problem.stack.pixels.covered
+    assert 0.05 < ((covered > 0.02) & (covered < 0.98)).float().mean() < 0.5 and (covered > 0.98).sum() > 100
+    assert terms["colour"] > 0 and terms["silhouette"] > 0
 
 
 def test_learnt_cameras_move_and_kept_ones_stay(tmp_path, scene):

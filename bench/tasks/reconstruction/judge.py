@@ -40,7 +40,7 @@ from renderers.field import Counts, Field
 
 SEEN_PREFIX = "seen_"  # marks metrics over the points of both surfaces that are visible in an input photograph
 SURFACE_METRICS = tuple(WORST_SURFACE)
-RENDERING_COST = "rendering_evaluations"
+RENDERING_COST = OWN_PREFIX + "evaluations"
 IMAGE_SCORES = {
     "psnr": "Peak signal-to-noise ratio over the pixels of a held-out photograph's mask, black where the shape is not"
     " seen, mean over photographs, in decibels, as IDR and NeuS define it. Without masks: over the pixels whose rays"

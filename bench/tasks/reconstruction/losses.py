@@ -101,7 +101,6 @@ class Losses:
             pixels: the compared pixels; for `colour_gradient` in groups of four, see `Stack.draw`.
             background: the colours behind the shape. With it, colours are compared along all rays, without masks.
         """
-        self._check_several(pixels, background)
         rendering = render_checked(renderer, metered, pixels.rays)
         inside = pixels.inside(rendering.hit)
         points, rays = rendering.points[inside], inside.numel()
@@ -186,19 +185,17 @@ class Losses:
             terms["colour_gradient"] = self.colour_gradient * _neighbour_error(difference, compared) / count
         return terms
 
-    def _check_several(self, pixels: Pixels, background: Background | None) -> None:
-        """Raises BadInput for several rays per pixel with terms of single rays."""
-        if not pixels.several:
-            return
-        observations = {"depth": pixels.distance, "normals": pixels.normals}
-        used = [
-            f"task.losses.{name}=0"
-            for name, observed in observations.items()
-            if getattr(self, name) and observed is not None
-        ]
-        used += ["task.losses.colour_of=blended"] if self.colour_of == SAMPLES else []
-        if used:
-            raise BadInput(f"several rays per pixel compare colours and masks: set {' '.join(used)}")
+    def check_several(self, *, depths: bool) -> None:
+        """Raises BadInput for terms that compare single rays.
+
+        Args:
+            depths: whether depths are given.
+        """
+        used = {"depths.points=none": depths, "losses.normals=0": bool(self.normals)}
+        used["losses.colour_of=blended"] = self.colour_of == SAMPLES
+        if remedies := " ".join(f"task.{remedy}" for remedy, is_used in used.items() if is_used):
+            reason = "several rays per pixel compare colours and masks"
+            raise BadInput(f"{reason}: remove view.rays_per_pixel, or set {remedies}")
 
 
 def _volume_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "n 3"]:

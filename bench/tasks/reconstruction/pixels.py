@@ -13,7 +13,7 @@ from datasets.shot import Shot
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import BadInput
 
-FILLED = 0.999  # fraction of a pixel from which the object fills it; undistorted masks are interpolated
+FILLED = 0.98  # fraction of a pixel from which the object fills it; compressed and undistorted masks have noise
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from datasets.files.captures.sphere import in_world
 from datasets.files.coincidence import compare_outlines, points_in_sphere, settled
 from datasets.files.meshes import read_pieces, read_points
 from datasets.mesh import Mesh, fit_in_sphere
-from datasets.photographs import Photography, with_areas
-from datasets.scene import Photographed, Surface, Truth, sample_surface, see
+from datasets.photographs import Photography
+from datasets.scene import Photographed, Surface, Truth, sample_surface, see, see_area
 from datasets.shot import Shot
 from datasets.views import observed_pixels
 from renderers.checks import BadInput, check_at_least
@@ -204,17 +204,16 @@ class PhotographTask(ABC):
             camera = scene.view.camera.resized(self.longest, self.longest)
             seed, truth, to_world, points, truth_notes = scene.seed(inputs.seed), scene.mesh, None, None, []
             shots = tuple(self.images.take(Truth(truth), camera, seed=seed))
-            if inputs.views.rays_per_pixel > 1:
-                shots = tuple(with_areas(shots, Truth(truth)))
             summary = f"{len(shots)} rendered photographs of {self.longest} x {self.longest} pixels"
         step = self.held_out
         held_out, input_shots = shots[::step], tuple(shot for index, shot in enumerate(shots) if index % step)
         if len(input_shots) < MIN_INPUT_PHOTOGRAPHS:
             raise BadInput(f"{len(shots)} photographs with every {step}th held out leave {len(input_shots)}: give more")
         input_shots = tuple(self.depths.apply(shot, (seed, index)) for index, shot in enumerate(input_shots))
-        input_shots = (
-            input_shots if self.masks else tuple(replace(shot, mask=None, covered=None) for shot in input_shots)
-        )
+        if not self.masks:
+            input_shots = tuple(replace(shot, mask=None, covered=None) for shot in input_shots)
+        elif inputs.photographed is None and inputs.views.rays_per_pixel > 1:
+            input_shots = tuple(replace(s, covered=see_area(Truth(truth), s.camera)[0]) for s in input_shots)
         summary += f"; {len(held_out)} of them {'is' if len(held_out) == 1 else 'are'} held out"
         summary = "; ".join([summary, *truth_notes])
         return Subject(input_shots, held_out, truth, summary, to_world, points)

@@ -8,7 +8,7 @@ import torch
 
 from bench.config import AUTO
 from bench.evaluate.state import State
-from bench.setup.inputs import RunContext
+from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.optimise import OptimiserSettings, with_affordable_rays
 from bench.solve.solve import check_field_gradient, solve_and_draw
 from bench.tasks.reconstruction import background as behind
@@ -23,6 +23,7 @@ from bench.tasks.reconstruction.subject import (
     GIVEN,
     GUIDES,
     HULL,
+    NONE,
     PhotographTask,
     Subject,
     given_distances,
@@ -98,6 +99,11 @@ class Reconstruction(PhotographTask):
         check_at_least("task.camera_noise", self.camera_noise or 0, 0, "0 keeps the cameras")
         if self.losses.colour_gradient and self.rays % 4:
             raise ValueError(f"task.rays must be a multiple of 4 for patches of 2 x 2 pixels, not {self.rays}: 1024")
+
+    def check(self, inputs: RunInputs) -> None:
+        """Raises BadInput for several rays per pixel with observations of single rays."""
+        if inputs.views.rays_per_pixel > 1:
+            self.losses.check_several(depths=self.depths.points != NONE)
 
     def execute(self, run: RunContext) -> None:
         name, inputs = run.inputs.field.name, run.inputs

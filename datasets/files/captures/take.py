@@ -82,12 +82,17 @@ def _read_shot(frame: Frame, longest: int, white: int | None = None) -> tuple[Sh
         camera = Camera(torch.from_numpy(intrinsics), torch.from_numpy(frame.world_to_camera), size[1], size[0])
     except ValueError as error:
         raise BadInput(f"the camera of {frame.image}: {error}") from None
-    covered = None if opacity is None else torch.from_numpy(np.ascontiguousarray(opacity[..., 0]))
-    mask = None if covered is None else covered > 0.5
+    mask = None if opacity is None else torch.from_numpy(opacity[..., 0] > 0.5)
+    covered = None if opacity is None else torch.from_numpy(_relative_to_peak(opacity[..., 0]))
     if frame.depth is not None and depth is not None and mask is not None:
         check_object_depths(depth[mask & (depth > 0)].double().numpy(), frame.depth[0])
     stored = torch.from_numpy(np.ascontiguousarray(colours))
     return Shot(frame.image.name, camera, stored, mask, depth, covered=covered), missing
+
+
+def _relative_to_peak(opacity: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Fractions of pixels; the white of some masks is below 1."""
+    return np.ascontiguousarray(opacity / max(float(opacity.max()), 0.5))
 
 
 def exif_notes(frames: Sequence[Frame]) -> tuple[str, ...]:

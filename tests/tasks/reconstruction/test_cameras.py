@@ -27,6 +27,8 @@ def test_moved_rays_are_those_of_the_moved_camera():
         expected = CAMERAS[index].with_object_moved(twists[index]).rays().flat()
         assert torch.allclose(result.origins, expected.origins, atol=1e-5)
         assert torch.allclose(result.directions, expected.directions, atol=1e-5)
+        several = Rays(rays.origins.view(16, 4, 3), rays.directions.view(16, 4, 3))
+        assert torch.equal(moved(several, twists, torch.full((16,), index)).directions.view(64, 3), result.directions)
 
 
 def test_a_disturbance_turns_all_cameras_but_the_first_by_its_angle(monkeypatch):

@@ -10,8 +10,9 @@ from torch import Tensor
 from bench.config import load
 from bench.solve import pixel_area
 from bench.solve.latent_code import Terms
+from bench.tasks.reconstruction.background import OneColour
 from bench.tasks.reconstruction.losses import CUBE_POINTS, NEIGHBOUR_CUBE_SIDE, Losses
-from bench.tasks.reconstruction.pixels import Pixels
+from bench.tasks.reconstruction.pixels import FILLED, Pixels
 from datasets.shot import Shot
 from renderers.camera import Camera, Rays
 from renderers.checks import BadInput
@@ -140,7 +141,7 @@ def test_the_colour_of_a_filled_pixel_is_the_mean_over_its_rays(name):
     renderer, pixels = RENDERERS.get(name) or load("renderer", name), several(4)
     distance = BALL.distance(pixels.rays)
     points = pixels.rays.at(distance)
-    filled = pixels.covered == 1
+    filled = pixels.covered > FILLED
     mean = BALL.colours(points, BALL.normals(points), pixels.rays.directions).mean(1)
     expected = (mean - pixels.colours)[filled].abs().sum() / 64
     terms = losses(colour=1.0)(renderer, BALL, Meter(BALL), pixels)
@@ -160,12 +161,37 @@ def test_fractions_of_pixels_are_compared_by_the_area_loss_and_by_losses_of_mask
 
 
 def test_observations_of_single_rays_are_refused_with_several():
-    given = several(4, distance=DISTANCE, normals=torch.zeros(64, 3, dtype=torch.float64))
-    with pytest.raises(BadInput, match=r"set task\.losses\.depth=0 task\.losses\.normals=0"):
-        terms_of(losses(colour=1.0, depth=1.0, normals=1.0), BALL, given)
-    assert terms_of(losses(colour=1.0), BALL, given)["colour"] > 0
-    with pytest.raises(BadInput, match=r"set task\.losses\.colour_of=blended"):
-        losses(colour=1.0, colour_of="samples")(load("renderer", "neus"), BALL, Meter(BALL), several(4))
+    losses(colour=1.0).check_several(depths=False)
+    with pytest.raises(BadInput, match=r"set task\.depths\.points=none task\.losses\.normals=0$"):
+        losses(colour=1.0, normals=1.0).check_several(depths=True)
+    with pytest.raises(BadInput, match=r"remove view\.rays_per_pixel, or set task\.losses\.colour_of=blended"):
+        losses(colour=1.0, colour_of="samples").check_several(depths=False)
+
+
+def test_a_volume_of_which_some_rays_miss_has_the_mean_colour_of_all_rays_of_a_filled_pixel():
+    small, pixels, renderer = ball(0.5), several(4), load("renderer", "neus")
+    terms = losses(colour=1.0)(renderer, small, Meter(small), pixels)
+    volume = renderer.render(small, pixels.rays).volume
+    flat = pixels.rays.flat()[volume.ray]
+    points = flat.at(volume.distance)
+    seen = volume.weighted_sum(small.colours(points, small.normals(points), flat.directions), 256).view(64, 4, 3)
+    opacity = volume.weighted_sum(torch.ones_like(volume.weight), 256).view(64, 4)
+    filled = pixels.covered > FILLED
+    assert int((opacity[filled] < 0.5).sum()) > 3
+    expected = (seen.mean(1) - pixels.colours)[filled].abs().sum() / 64
+    assert terms["colour"].item() == pytest.approx(expected.item(), rel=0.02)
+
+
+@each("name", ["idr", "neus"])
+def test_behind_the_shape_all_rays_of_a_pixel_see_the_background(name):
+    away, pixels = ball(0.2, (0.0, 0.0, 0.0)), replace(several(4), mask=None, colours=torch.zeros(64, 3).double())
+    renderer = RENDERERS.get(name) or load("renderer", name)
+    terms = losses(colour=1.0)(renderer, away, Meter(away), pixels, OneColour(1.0))
+    rendering = renderer.render(away, pixels.rays)
+    colours = away.colours(rendering.points, away.normals(rendering.points), pixels.rays.directions)
+    share = rendering.opacity[..., None]
+    expected = (share * colours + 1 - share).mean(1).abs().sum() / 64
+    assert terms["colour"].item() == pytest.approx(expected.item(), rel=1e-6 if name == "idr" else 0.02)
 
 
 @each("target", [0.0, 1.0, None])

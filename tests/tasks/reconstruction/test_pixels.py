@@ -62,12 +62,12 @@ def test_patches_are_neighbours_in_one_photograph():
 
 @each("count", [4, 16])
 def test_several_rays_lie_in_the_cells_of_their_pixel_of_the_right_photograph(count):
-    shots, side = [replace(shot, covered=shot.mask.float()) for shot in SHOTS], isqrt(count)
+    shots, side = [replace(shot, covered=0.5 + 0.5 * shot.mask) for shot in SHOTS], isqrt(count)
     stack = Stack.build(shots, None, CPU)
     drawn = stack.draw(200, patches=False, seed=0)
     pixels = stack.with_rays(drawn, count, torch.Generator().manual_seed(0))
     assert pixels.several and not drawn.several and pixels.rays.shape == (200, count)
-    assert torch.equal(pixels.covered, drawn.mask.float())
+    assert torch.equal(pixels.covered, 0.5 + 0.5 * drawn.mask)
     for number, shot in enumerate(shots):
         here = positions(pixels)[:, 0] == number
         points = pixels.rays.at(torch.ones(200, count))[here]
