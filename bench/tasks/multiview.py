@@ -293,7 +293,7 @@ class PhotometricLoss:
                 compared = visible[k] & shown[..., None]
             pixels, _ = self.cameras[other].project(rendering.points[k][compared])
             warped, inside = sample(images[other], pixels)
-            if several:  # the neighbour sees these points, so they are inside
+            if several and len(warped):  # the neighbour sees these points, so they are inside
                 warped, inside = torch.segment_reduce(warped, "mean", lengths=compared[shown].sum(-1)), slice(None)
             differences.append((warped - observed[k][shown])[inside].abs().mean(-1))
         errors = torch.cat(differences)

@@ -139,6 +139,8 @@ def test_a_draw_that_both_views_see_nowhere_is_no_failure(scene):
     losses = [drawn.compare(small, iteration)["photometric"].item() for iteration in range(20)]
     assert losses.count(0.0) > 5 and np.isfinite(losses).all()
     assert drawn.compare_at(small, 0)["photometric"] > 0
+    several = problem_of(replace(scene, rays_per_pixel=4), pixel_block=8)
+    assert 0.0 in [several.compare(small, iteration)["photometric"].item() for iteration in range(20)]
     with pytest.raises(CannotContinue):
         drawn.compare_at(sphere(0.001).translate((0.9, 0.9, 0.0)), 0)
 
