@@ -325,7 +325,10 @@ def values_and_gradients(
 
 
 def gradients_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """The field's gradients at points, with a graph; central differences if the field has a `slope_width`."""
+    """The field's gradients at points, differentiable in its parameters and the points.
+
+    They are central differences if the field has a `slope_width`.
+    """
     if width := getattr(field.inner if isinstance(field, Meter) else field, "slope_width", 0.0):
         return central_differences(field, points, width)
     points = points if points.requires_grad else points.detach().requires_grad_(True)

@@ -36,7 +36,7 @@ def colours_in_view(state: State, view: View) -> Float[Tensor, "height width 3"]
 def render_image(
     field: Coloured, camera: Camera, inputs: RunInputs, counts: Counts | None = None
 ) -> tuple[View, Float[Tensor, "height width 3"]]:
-    """See `render_with_view`: the hits, and their colours or a volume's weighted sums."""
+    """The hits as a View, and the colours of the surface or of the volume; see `render_with_view`."""
     rendering, view = render_with_view(field, camera, inputs, counts)
     volume = rendering.volume
     if volume is None:

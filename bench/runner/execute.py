@@ -30,7 +30,7 @@ def main(record: Record, channel: Connection) -> None:
     notices_to(lambda text: channel.send(Notice(text)))
     channel.send(Started())
     try:
-        signal.signal(signal.SIGTERM, _stop)  # until here it ends the process at once
+        signal.signal(signal.SIGTERM, _stop)  # before this, SIGTERM ends the process at once
         execute(record, channel.send)
     except KeyboardInterrupt:
         record.status = RunStatus.KILLED

@@ -142,7 +142,7 @@ def _send_result(work: Callable[[Any], Any], argument: Any, sender: Connection) 
 
 
 def _run(record: Record, channel: Connection) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a worker's handler is inherited
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # else it keeps the handler of its parent worker
     for module in preloaded_modules():  # before `Started`, so that the run's time excludes it
         with suppress(ImportError):
             import_module(module)

@@ -4,10 +4,10 @@ from typing import Any
 
 import pandas as pd
 
-from bench.report.study import NO_TIMES, Result, Runs, Selection, format, records, statistics, table
+from bench.report.study import Result, Runs, Selection, format, records, statistics, table
 
 PLACE = 48
-READS = (Selection("scans", ("task.depths",), setup=NO_TIMES[:2]),)
+READS = (Selection("scans", ("task.depths",), setup=("scenes", "pixels")),)
 METRICS = {"chamfer_l2": "Chamfer", records.ONE_WAY: "truth to prediction", "depth_mae": "depth error"}
 EXACT, MEASURED, RATIO = "exact", "measured", "ratio"  # two values of task.depths, and the ratio of their errors
 COLUMNS = (

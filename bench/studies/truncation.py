@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.report.study import NO_TIMES, Result, Runs, Selection, chart, compare, statistics, table
+from bench.report.study import SETUP_WITHOUT_MACHINE, Result, Runs, Selection, chart, compare, statistics, table
 
 PLACE = 24
-READS = (Selection("truncation", ("renderer.alpha", "renderer.step_clamp", "prior.truncation"), setup=NO_TIMES),)
+READS = (
+    Selection("truncation", ("renderer.alpha", "renderer.step_clamp", "prior.truncation"), setup=SETUP_WITHOUT_MACHINE),
+)
 SERIES = {  # (truncated prior, clamped steps): name, and the preset that gives the line style
     (True, True): ("truncated field, clamped steps: DIST's own", "dist_aggressive"),
     (True, False): ("truncated field", "dist_step_floor"),

@@ -206,8 +206,8 @@ class Multiview:
 class PhotometricLoss:
     """Compares photographs: `compare` renders a field's depths and warps the photographs by them.
 
-    With several rays per pixel, a pixel is compared if all of them hit, and the neighbour sees half of the points, by
-    the mean of their colours there. The silhouette loss compares fractions of pixels; see `bench.solve.pixel_area`.
+    A pixel with several rays is compared if all of them hit and the neighbour sees at least half of their points, by
+    the mean of their colours there. The silhouette loss compares covered fractions; see `bench.solve.pixel_area`.
     """
 
     def __init__(

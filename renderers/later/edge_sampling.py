@@ -169,7 +169,7 @@ class CellGrid:
             index = index.view(rays.shape)
         else:  # from [*batch, height, width, column, row] in a pixel
             side = isqrt(rays.shape[-1])
-            index = index.view(*rays.shape[:-1], side, side).transpose(-3, -1).transpose(-2, -1).reshape(image.shape)
+            index = index.view(*rays.shape[:-1], side, side).movedim(-1, -3).reshape(image.shape)
         order = index.flatten().argsort()
         vectors = [tensor.detach() for tensor in (image.origins, image.directions)]
         steps = [_step(tensor, dim).reshape(-1, 3)[order] for dim in (-2, -3) for tensor in vectors]

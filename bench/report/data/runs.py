@@ -47,7 +47,7 @@ MEASUREMENT_METRICS = {  # for tasks that measure without optimising
 ROW_SECTIONS = ("renderer", "task", "silhouette", "field")  # settings in which rows of equal names may differ
 
 
-NO_TIMES = ("scenes", "pixels", "network")  # the `setup` of pages without runtimes, which need no machine
+SETUP_WITHOUT_MACHINE = ("scenes", "pixels", "network")
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Selection:
 
     experiment: str
     conditions: tuple[str, ...] = ()
-    setup: tuple[str, ...] = (*NO_TIMES, "machine")
+    setup: tuple[str, ...] = (*SETUP_WITHOUT_MACHINE, "machine")
     alike: tuple[str, ...] = ()
     must_agree: tuple[str, ...] = ()
     may_differ: tuple[str, ...] = ()

@@ -62,7 +62,7 @@ class Appearance:
     def __post_init__(self) -> None:
         check_at_least("task.appearance.octaves", self.octaves, 0, "5 follow details of a pixel at 128 x 128")
         check_positive("task.appearance.radius", self.radius, "0.5 lies within most objects")
-        check_at_least("task.appearance.slope_width", self.slope_width, 0, "0.04 is a cell of the finest grid")
+        check_at_least("task.appearance.slope_width", self.slope_width, 0, "0.066 is two cells of the finest grid")
 
     def make(self, name: str) -> Learnt:
         """Builds the initial field of a name.

@@ -27,9 +27,9 @@ NEIGHBOUR_CUBE_SIDE = 2e-3  # scene units: a neighbour is drawn in this cube; DV
 class Losses:
     """Weights of the terms; 0 leaves a term out. Sums over rays are divided by the number of all rays.
 
-    With several rays per pixel, a colour is the mean over the rays of a pixel, and without a background it is compared
-    in pixels that the object fills; a surface's is the mean over hits. The silhouette loss compares fractions of pixels
-    (`bench.solve.pixel_area`).
+    With several rays per pixel, the colour of a pixel is the mean over its rays; a surface's, over those that hit. With
+    masks, only pixels that the object fills are compared. Colour errors are divided by the number of pixels. The
+    silhouette loss compares covered fractions (`bench.solve.pixel_area`).
 
     Args:
         colour: weight of the l1 error of colours, over hits on the foreground (DVR, Eq. 12). Volume renderers: of the
@@ -185,8 +185,8 @@ class Losses:
             terms["colour_gradient"] = self.colour_gradient * _neighbour_error(difference, compared) / count
         return terms
 
-    def check_several(self, *, depths: bool) -> None:
-        """Raises BadInput for terms that compare single rays.
+    def check_rays_per_pixel(self, *, depths: bool) -> None:
+        """Raises BadInput for losses of depths, normals and samples, which need one ray per pixel.
 
         Args:
             depths: whether depths are given.
@@ -194,7 +194,7 @@ class Losses:
         used = {"depths.points=none": depths, "losses.normals=0": bool(self.normals)}
         used["losses.colour_of=blended"] = self.colour_of == SAMPLES
         if remedies := " ".join(f"task.{remedy}" for remedy, is_used in used.items() if is_used):
-            reason = "several rays per pixel compare colours and masks"
+            reason = "several rays per pixel compare only colours and silhouettes"
             raise BadInput(f"{reason}: remove view.rays_per_pixel, or set {remedies}")
 
 

@@ -13,7 +13,7 @@ from datasets.shot import Shot
 from renderers.camera import Camera, Rays, sphere_span
 from renderers.checks import BadInput
 
-FILLED = 0.98  # fraction of a pixel from which the object fills it; compressed and undistorted masks have noise
+FILLED = 0.98  # a pixel above this covered fraction counts as filled: compressed and undistorted masks have noise
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Pixels:
         return len(self.rays.shape) > 1
 
     def inside(self, hit: Bool[Tensor, " *rays"]) -> Bool[Tensor, " *rays"]:
-        """The rays among `hit` whose pixel is on the object: by its mask, or filled by it if it has several rays."""
+        """The rays of `hit` in pixels of the object: by masks or, with several rays per pixel, in filled pixels."""
         if self.mask is None:
             return hit
         return hit & (self.covered > FILLED)[:, None] if self.several else hit & self.mask
@@ -67,7 +67,7 @@ class Stack:
         useful: indices of pixels that may be drawn.
         corners: indices of pixels that may be drawn as the upper left pixel of a 2 x 2 patch.
         width: width of each pixel's photograph.
-        steps: of each photograph, the world vectors from a pixel to the next at camera z 1: to the right, and down.
+        steps: world vectors [photograph, right or down, xyz] between centres of neighbouring pixels at camera z 1.
     """
 
     pixels: Pixels

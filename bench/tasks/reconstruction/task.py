@@ -103,7 +103,7 @@ class Reconstruction(PhotographTask):
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput for several rays per pixel with observations of single rays."""
         if inputs.views.rays_per_pixel > 1:
-            self.losses.check_several(depths=self.depths.points != NONE)
+            self.losses.check_rays_per_pixel(depths=self.depths.points != NONE)
 
     def execute(self, run: RunContext) -> None:
         name, inputs = run.inputs.field.name, run.inputs

@@ -91,7 +91,7 @@ def _read_shot(frame: Frame, longest: int, white: int | None = None) -> tuple[Sh
 
 
 def _relative_to_peak(opacity: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Fractions of pixels; the white of some masks is below 1."""
+    """Opacity over its maximum, or over 0.5 if that is smaller: some masks have a darker white."""
     return np.ascontiguousarray(opacity / max(float(opacity.max()), 0.5))
 
 

@@ -161,11 +161,11 @@ def test_fractions_of_pixels_are_compared_by_the_area_loss_and_by_losses_of_mask
 
 
 def test_observations_of_single_rays_are_refused_with_several():
-    losses(colour=1.0).check_several(depths=False)
+    losses(colour=1.0).check_rays_per_pixel(depths=False)
     with pytest.raises(BadInput, match=r"set task\.depths\.points=none task\.losses\.normals=0$"):
-        losses(colour=1.0, normals=1.0).check_several(depths=True)
+        losses(colour=1.0, normals=1.0).check_rays_per_pixel(depths=True)
     with pytest.raises(BadInput, match=r"remove view\.rays_per_pixel, or set task\.losses\.colour_of=blended"):
-        losses(colour=1.0, colour_of="samples").check_several(depths=False)
+        losses(colour=1.0, colour_of="samples").check_rays_per_pixel(depths=False)
 
 
 def test_a_volume_of_which_some_rays_miss_has_the_mean_colour_of_all_rays_of_a_filled_pixel():
