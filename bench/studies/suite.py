@@ -330,8 +330,9 @@ def failures(made: Standing) -> str:
     if most.empty:
         return f"{failed or 'None'} of {runs} runs failed."
     names = [
-        f"{row} failed in {name} at {units(budget)} ({line.failed} of {line.runs})"
-        for (row, budget, name), line in most.iterrows()
+        f"{row} failed in {name} at "
+        + " and ".join(f"{units(key[1])} ({line.failed} of {line.runs})" for key, line in at_budgets.iterrows())
+        for (row, name), at_budgets in most.groupby(level=["row", "set"], sort=False)
     ]
     return f"{'; '.join(names)}; {failed or 'none'} of {runs} others failed."
 
