@@ -105,7 +105,7 @@ def _verdict(verdicts: list[str]) -> str:
     measured = f"*{holds}* of {holds + few + sum(tested.values())} measured comparisons hold{on_few}."
     others = f"Others: {'; '.join(f'{kind} {count}' for kind, count in tested.items()) or 'none'}."
     checked = format.plural(kinds.count(CHECKED), "claim")
-    rest = f"Tests of this project check {checked}, and {kinds.count(UNTESTED)} are not tested."
+    rest = f"Tests of this project check {checked}. Not tested: {kinds.count(UNTESTED)}."
     return f"{measured} {others} {rest}"
 
 
