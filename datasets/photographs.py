@@ -1,13 +1,13 @@
 """Colour images of a textured mesh from several cameras, with noise, blur and exposure of a real camera."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
 
-from datasets.scene import Truth, see
+from datasets.scene import Truth, see, see_area
 from datasets.shot import Shot
 from datasets.textures import ONE_COLOUR, TEXTURES, Texture, make_texture
 from datasets.views import look_at
@@ -65,13 +65,14 @@ class Photography:
         for name in ("noise", "blur", "exposure"):
             check_at_least(name, getattr(self, name), 0, f"{name}=0 switches it off")
 
-    def take(self, truth: Truth, first: Camera, *, seed: int) -> list[Shot]:
-        """Takes the photographs of a mesh.
+    def take(self, truth: Truth, first: Camera, *, seed: int, areas: bool = False) -> list[Shot]:
+        """Takes the photographs of a mesh; with `areas`, also the fraction of each pixel that the mesh covers.
 
         Raises:
             ValueError: a camera does not see the mesh, or its surface has one colour.
         """
-        return self.take_from(truth, CAMERA_LAYOUTS[self.places](first, self.views), seed=seed)
+        taken = self.take_from(truth, CAMERA_LAYOUTS[self.places](first, self.views), seed=seed)
+        return [replace(shot, covered=see_area(truth, shot.camera)[0]) for shot in taken] if areas else taken
 
     def take_from(self, truth: Truth, cameras: Sequence[Camera], *, seed: int) -> list[Shot]:
         """Takes the photographs of a mesh with `cameras`; see `take`."""

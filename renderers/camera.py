@@ -19,8 +19,7 @@ class Rays:
     Args:
         cells: of rays [*batch, height, width, k * k] in pixels of k x k equal cells, column by column, with a ray
             anywhere in each cell: the image [*batch, height * k, width * k] of rays through the cells' centres, with
-            the same gradient.
-            `bench.solve.pixel_area.random_rays` makes both.
+            the same gradient. `bench.solve.pixel_area.random_rays` makes both.
     """
 
     origins: Float[Tensor, "*rays 3"]

@@ -324,8 +324,8 @@ def values_and_gradients(
     return value.detach(), gradient
 
 
-def gradients_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """The field's gradients at points, differentiable in its parameters and the points.
+def gradients_at(field: Field, points: Float[Tensor, "n 3"], *, graph: bool = True) -> Float[Tensor, "n 3"]:
+    """The field's gradients at points, with `graph` differentiable in its parameters and the points.
 
     They are central differences if the field has a `slope_width`.
     """
@@ -333,7 +333,7 @@ def gradients_at(field: Field, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n
         return central_differences(field, points, width)
     points = points if points.requires_grad else points.detach().requires_grad_(True)
     with torch.enable_grad():  # also if the caller needs the loss alone
-        return torch.autograd.grad(field(points).sum(), points, create_graph=True)[0]
+        return torch.autograd.grad(field(points).sum(), points, create_graph=graph)[0]
 
 
 def central_differences(field: Field, points: Float[Tensor, "n 3"], width: float) -> Float[Tensor, "n 3"]:

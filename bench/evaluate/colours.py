@@ -76,7 +76,7 @@ def colours_at(
     colours = [points.new_zeros(0, 3)]
     for start in range(0, len(points), POINTS_PER_BATCH):
         chunk = points[start : start + POINTS_PER_BATCH].to(device)
-        gradients = gradients_at(field, chunk).detach()
+        gradients = gradients_at(field, chunk, graph=False).detach()
         inwards = -torch.nn.functional.normalize(gradients, dim=-1)
         view_directions = inwards if directions is None else directions[start : start + POINTS_PER_BATCH].to(device)
         with torch.no_grad():

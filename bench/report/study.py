@@ -11,6 +11,6 @@ from bench.records import format
 from bench.report import breakdowns, compare, condition_curves, conditions, gallery, medians
 from bench.report.compare import published
 from bench.report.data import curves, records, statistics
-from bench.report.data.runs import SETUP_WITHOUT_MACHINE, NoFolder, Runs, Selection, merge_runs
+from bench.report.data.runs import NoFolder, Runs, Selection, merge_runs
 from bench.report.write import chart, table
 from bench.report.write.result import Result

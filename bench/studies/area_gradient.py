@@ -2,11 +2,11 @@
 
 from math import nan
 
-from bench.report.study import SETUP_WITHOUT_MACHINE, Selection, condition_curves
+from bench.report.study import Selection, condition_curves
 
 PLACE = 202
 RAYS = "view.rays_per_pixel"
-READS = (Selection("area_gradient", (RAYS,), setup=SETUP_WITHOUT_MACHINE),)
+READS = (Selection("area_gradient", (RAYS,), setup=Selection.WITHOUT_MACHINE),)
 NOTES = [
     "The area is the sum of the opacities of an image of 24 x 24 pixels. A pixel's opacity is the mean over its rays."
     " The gradient is for the prior's code, along 4 random directions, at training shapes of the prior.",

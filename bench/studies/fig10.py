@@ -5,18 +5,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.study import (
-    SETUP_WITHOUT_MACHINE,
-    Result,
-    Runs,
-    Selection,
-    chart,
-    conditions,
-    medians,
-    records,
-    statistics,
-    table,
-)
+from bench.report.study import Result, Runs, Selection, chart, conditions, medians, records, statistics, table
 
 PLACE = 50
 CONDITIONS = (
@@ -24,7 +13,7 @@ CONDITIONS = (
     conditions.Condition("start_scale", "noise in the initial code (prior's σ)", 1.0),
 )
 KEYS = tuple(f"task.{condition.key}" for condition in CONDITIONS)
-READS = (Selection("fig10", KEYS, setup=SETUP_WITHOUT_MACHINE, may_differ=("prior.truncation",)),)
+READS = (Selection("fig10", KEYS, setup=Selection.WITHOUT_MACHINE, may_differ=("prior.truncation",)),)
 NOTES = (
     "One condition varies, and the other is at 1. The noise is in standard deviations of the prior's training codes. "
     "At 0, a run starts from the mean shape or, with an encoder, from the encoder's code.",

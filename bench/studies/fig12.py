@@ -7,17 +7,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from bench.report.data.records import CHAMFER_SCALE, ONE_WAY, Record, error, family, grouped, row_of, setting, solid
-from bench.report.study import (
-    SETUP_WITHOUT_MACHINE,
-    Result,
-    Runs,
-    Selection,
-    chart,
-    conditions,
-    gallery,
-    statistics,
-    table,
-)
+from bench.report.study import Result, Runs, Selection, chart, conditions, gallery, statistics, table
 
 PLACE = 55
 CONDITIONS = (
@@ -26,7 +16,7 @@ CONDITIONS = (
     conditions.Condition("scale", "size / true size", 1.0),
 )
 KEYS = (*(f"task.{condition.key}" for condition in CONDITIONS), "task.similarity")
-READS = (Selection("fig12", KEYS, setup=SETUP_WITHOUT_MACHINE, may_differ=("prior.truncation",)),)
+READS = (Selection("fig12", KEYS, setup=Selection.WITHOUT_MACHINE, may_differ=("prior.truncation",)),)
 MAX_ERROR = 1.0  # squared scene units x 1000: about the errors of DIST, Table 3; a success has less
 NOTES = (
     f"A success ended ok with an error below {MAX_ERROR:g}. Its interval is over shapes (Clopper and Pearson).",

@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.report.study import SETUP_WITHOUT_MACHINE, Runs, Selection, condition_curves, statistics
+from bench.report.study import Runs, Selection, condition_curves, statistics
 
 PLACE = 51
 RAYS = "view.rays_per_pixel"
-READS = (Selection("multiview_rays", (RAYS,), setup=SETUP_WITHOUT_MACHINE),)
+READS = (Selection("multiview_rays", (RAYS,), setup=Selection.WITHOUT_MACHINE),)
 MASK_ROWS = tuple(f"multiview_mask{name}" for name in ("", "_neus", "_opaque", "_volsdf", "_unisurf"))
 NOTES = (
     "A prior's code is fitted, from a random code, to the colours and silhouettes of 12 photographs of 32 x 32 pixels. "

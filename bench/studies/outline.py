@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.report.study import SETUP_WITHOUT_MACHINE, Runs, Selection, condition_curves, statistics
+from bench.report.study import Runs, Selection, condition_curves, statistics
 
 PLACE = 27
 RAYS = "view.rays_per_pixel"
-READS = (Selection("outline", (RAYS,), setup=SETUP_WITHOUT_MACHINE),)
+READS = (Selection("outline", (RAYS,), setup=Selection.WITHOUT_MACHINE),)
 CONTROLS = tuple(f"outline_{name}_{kept}" for name in ("relaxed", "neus") for kept in ("mask", "fraction"))
 NOTES = (
     "A prior's code is fitted to the mask of one image of 24 x 24 pixels, without depth. The code is penalised little.",

@@ -5,11 +5,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bench.report.study import SETUP_WITHOUT_MACHINE, Result, Runs, Selection, chart, compare, statistics, table
+from bench.report.study import Result, Runs, Selection, chart, compare, statistics, table
 
 PLACE = 24
 READS = (
-    Selection("truncation", ("renderer.alpha", "renderer.step_clamp", "prior.truncation"), setup=SETUP_WITHOUT_MACHINE),
+    Selection(
+        "truncation", ("renderer.alpha", "renderer.step_clamp", "prior.truncation"), setup=Selection.WITHOUT_MACHINE
+    ),
 )
 SERIES = {  # (truncated prior, clamped steps): name, and the preset that gives the line style
     (True, True): ("truncated field, clamped steps: DIST's own", "dist_aggressive"),

@@ -1,7 +1,7 @@
 """Shape from many views: optimises the code for photometric consistency between views (DIST, Sec. 4.2.2)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import radians
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -17,7 +17,7 @@ from bench.solve.pixel_area import observation_of, random_rays_of
 from bench.solve.pixel_draw import PixelDraw
 from bench.solve.solve import check_field_gradient, metric_definitions, solve_and_draw
 from datasets.photographs import Photography
-from datasets.scene import Scene, see_area
+from datasets.scene import Scene
 from datasets.shot import Shot
 from renderers.boundary import render_checked
 from renderers.camera import Rays, stacked
@@ -163,10 +163,9 @@ class Multiview:
             return with_affordable_rays(self, lambda task: task.problem(scene, prior, renderer, **of_scene))
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
-        photographs = self.images.take(scene.raycaster, scene.view.camera.zoomed(self.focal), seed=scene_seed)
-        rays = scene.rays_per_pixel
-        if rays > 1 and self.silhouette_weight:
-            photographs = [replace(shot, covered=see_area(scene.raycaster, shot.camera)[0]) for shot in photographs]
+        rays, camera = scene.rays_per_pixel, scene.view.camera.zoomed(self.focal)
+        areas = rays > 1 and self.silhouette_weight > 0
+        photographs = self.images.take(scene.raycaster, camera, seed=scene_seed, areas=areas)
         loss = PhotometricLoss(self, renderer, photographs, device, seed=scene_seed, rays_per_pixel=rays)
         return self.problem_of(prior, loss, generator)
 
@@ -239,9 +238,10 @@ class PhotometricLoss:
         self.colours = torch.stack([photograph.colours for photograph in photographs]).to(device)
         self.per_step = min(settings.views_per_step, len(photographs))
         count = len(photographs)
-        observed = "covered" if rays_per_pixel > 1 else "mask"
         masks = [
-            getattr(shot, observed) for shot in photographs if settings.silhouette_weight and shot.mask is not None
+            shot.covered if rays_per_pixel > 1 else shot.mask
+            for shot in photographs
+            if settings.silhouette_weight and shot.mask is not None
         ]
         self.neighbours = [(view + settings.neighbour) % count for view in range(count)]
         if from_user:
@@ -275,9 +275,11 @@ class PhotometricLoss:
         """
         renderer, images = at_iteration(self.renderer, iteration), self.images_at(iteration)
         views, neighbours = map(list, zip(*self.pairs(iteration), strict=True))
-        rays, observed = self._stack_rays(views), images[views]
+        observed = images[views]
         if several := self.rays_per_pixel > 1:
             rays = random_rays_of([self.cameras[view] for view in views], self.rays_per_pixel, self.seed, iteration)
+        else:
+            rays = self._stack_rays(views)
         is_drawn = drawn is not None
         if is_drawn:
             drawn = drawn.to(self.colours.device)

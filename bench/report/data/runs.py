@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pandas as pd
@@ -47,9 +47,6 @@ MEASUREMENT_METRICS = {  # for tasks that measure without optimising
 ROW_SECTIONS = ("renderer", "task", "silhouette", "field")  # settings in which rows of equal names may differ
 
 
-SETUP_WITHOUT_MACHINE = ("scenes", "pixels", "network")
-
-
 @dataclass(frozen=True)
 class Selection:
     """The runs that a study reads.
@@ -63,9 +60,11 @@ class Selection:
         may_differ: settings in which rows that are compared may differ.
     """
 
+    WITHOUT_MACHINE: ClassVar[tuple[str, ...]] = ("scenes", "pixels", "network")  # a setup, of pages without runtimes
+
     experiment: str
     conditions: tuple[str, ...] = ()
-    setup: tuple[str, ...] = (*SETUP_WITHOUT_MACHINE, "machine")
+    setup: tuple[str, ...] = (*WITHOUT_MACHINE, "machine")
     alike: tuple[str, ...] = ()
     must_agree: tuple[str, ...] = ()
     may_differ: tuple[str, ...] = ()

@@ -163,18 +163,17 @@ class Losses:
             if pixels.mask is None:
                 raise BadInput("task.losses.colour_of=samples needs masks: take colour_of=blended")
             return {"colour": self.colour * _sample_errors(shape, metered, pixels, volume)[pixels.mask].sum() / count}
-        inside, flat = pixels.inside(rendering.hit), pixels.rays.flat()
-        behind = torch.zeros_like(flat.directions) if background is None else background(flat)
+        flat, all_rays = pixels.rays.flat(), torch.ones_like(rendering.hit)
         if volume is None:
+            inside = pixels.inside(rendering.hit)
             surface = shape.colours(rendering.points[inside], gradients, pixels.rays.directions[inside])
-            colours = behind.index_put((inside.flatten(),), surface)
-            weight = inside if background is None else torch.ones_like(inside)
+            behind = torch.zeros_like(flat.directions) if background is None else background(flat)
+            colours, compared_rays = behind.index_put((inside.flatten(),), surface), inside
         else:
-            colours = (
-                _volume_colours(shape, metered, flat, volume) + (1 - rendering.opacity.flatten()[:, None]) * behind
-            )
-            weight = pixels.inside(torch.ones_like(inside)) if background is None else torch.ones_like(inside)
-        per_pixel = weight.view(count, -1)
+            colours, compared_rays = _volume_colours(shape, metered, flat, volume), pixels.inside(all_rays)
+            if background is not None:
+                colours = colours + (1 - rendering.opacity.flatten()[:, None]) * background(flat)
+        per_pixel = (compared_rays if background is None else all_rays).view(count, -1)
         compared = per_pixel.any(-1)
         mean = (colours.view(count, -1, 3) * per_pixel[..., None]).sum(1) / per_pixel.sum(-1).clamp_min(1)[:, None]
         difference = torch.where(compared[:, None], mean - pixels.colours, 0.0)

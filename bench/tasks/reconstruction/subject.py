@@ -21,7 +21,7 @@ from datasets.files.coincidence import compare_outlines, points_in_sphere, settl
 from datasets.files.meshes import read_pieces, read_points
 from datasets.mesh import Mesh, fit_in_sphere
 from datasets.photographs import Photography
-from datasets.scene import Photographed, Surface, Truth, sample_surface, see, see_area
+from datasets.scene import Photographed, Surface, Truth, sample_surface, see
 from datasets.shot import Shot
 from datasets.views import observed_pixels
 from renderers.checks import BadInput, check_at_least
@@ -203,7 +203,8 @@ class PhotographTask(ABC):
             scene = inputs.scene
             camera = scene.view.camera.resized(self.longest, self.longest)
             seed, truth, to_world, points, truth_notes = scene.seed(inputs.seed), scene.mesh, None, None, []
-            shots = tuple(self.images.take(Truth(truth), camera, seed=seed))
+            areas = self.masks and inputs.views.rays_per_pixel > 1
+            shots = tuple(self.images.take(scene.raycaster, camera, seed=seed, areas=areas))
             summary = f"{len(shots)} rendered photographs of {self.longest} x {self.longest} pixels"
         step = self.held_out
         held_out, input_shots = shots[::step], tuple(shot for index, shot in enumerate(shots) if index % step)
@@ -212,8 +213,6 @@ class PhotographTask(ABC):
         input_shots = tuple(self.depths.apply(shot, (seed, index)) for index, shot in enumerate(input_shots))
         if not self.masks:
             input_shots = tuple(replace(shot, mask=None, covered=None) for shot in input_shots)
-        elif inputs.photographed is None and inputs.views.rays_per_pixel > 1:
-            input_shots = tuple(replace(s, covered=see_area(Truth(truth), s.camera)[0]) for s in input_shots)
         summary += f"; {len(held_out)} of them {'is' if len(held_out) == 1 else 'are'} held out"
         summary = "; ".join([summary, *truth_notes])
         return Subject(input_shots, held_out, truth, summary, to_world, points)
