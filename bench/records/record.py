@@ -35,7 +35,7 @@ MAX_WAIT_FRACTION = 0.05  # if threads waited for a larger fraction of their rea
 NUMERIC_FIELDS = ("metrics", "metrics_start", "metrics_best", "evaluations", "seconds")
 NUMERIC_FIELDS += ("peak_memory_bytes", "flops", "gemm_fraction")
 # Fields that old records may lack.
-OPTIONAL_FIELDS = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "asked", "overrides")
+OPTIONAL_FIELDS = ("method", "scene", "config_hash", "code", "ended", "log", "notes", "pictures", "asked", "overrides")
 OPTIONAL_FIELDS += ("metrics_best",)
 # JSON has no such numbers: these strings stand for them.
 _NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
@@ -94,6 +94,7 @@ class Record:
     environment: dict[str, Any] = field(default_factory=dict)
     reused: bool = False
     notes: list[str] = field(default_factory=list)
+    pictures: dict[str, str] = field(default_factory=dict)  # small ones as data URIs, and their texts
     config_hash: str = ""
     code: str = ""  # hash of the code that ran, and of the files that it read
     asked: str = field(default_factory=now)  # time of the last request; a reused run ran earlier
@@ -109,9 +110,8 @@ class Record:
         """The text of `__repr__` and the run's picture, for notebooks."""
         picture = self.folder / "summary.png"
         data = b64encode(picture.read_bytes()).decode() if picture.is_file() else ""
-        return f"<p>{escape(repr(self))}</p>" + (
-            f'<img src="data:image/png;base64,{data}" width="800">' if data else ""
-        )
+        image = f'<img src="data:image/png;base64,{data}" width="800">' if data else ""
+        return f"<p>{escape(repr(self))}</p>{image}"
 
     @property
     def name(self) -> str:

@@ -63,7 +63,7 @@ def make(runs: Runs) -> Result:
     """A line per renderer: the axes on which it breaks first, the axis on which it is best, and its mean rank."""
     runs = runs.of_newest_scene()
     cells = breakdowns.cells_of(runs)
-    cells = cells.assign(ray=_rays(runs, cells))
+    cells = cells.assign(ray=_rays(runs, cells), pictures=[record.get("pictures") for record in runs.records])
     axes, ranked = breakdowns.axes_of(cells), cells[cells["row"].isin(breakdowns.ranked_rows(runs))]
     ranks, shared = breakdowns.ranks_of(ranked)
     rows = sorted(ranks, key=lambda row: (math.isnan(ranks[row].value), ranks[row].value))
@@ -109,7 +109,7 @@ def _data(runs: Runs, cells: pd.DataFrame, axes: pd.DataFrame) -> pd.DataFrame:
 
 def _atlas(cells: pd.DataFrame, axes: pd.DataFrame, rows: list[str]) -> dict[str, Any]:
     """The heat map for the page: axes, rows, and each cell's breakdown as text, mark, shade and run."""
-    shown = cells[["full", "mark", "status", "reason", "shade", "folder", "ray"]].astype({"shade": object})
+    shown = cells[["full", "mark", "status", "reason", "shade", "folder", "ray", "pictures"]].astype({"shade": object})
     shown["shade"] = shown["shade"].where(shown["shade"].notna(), None)
     cell_data = dict(zip(zip(cells["axis"], cells["row"], strict=True), shown.to_dict("records"), strict=True))
     return {

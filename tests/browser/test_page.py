@@ -58,6 +58,10 @@ def results(tmp_path_factory):
     return folder
 
 
+DOT = "data:image/png;base64,iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJ"  # a picture of one pixel
+DOT += "AAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
+
+
 def write_tables(results):
     """`speed_front` with a chart, and the atlas with its curves, one cell of which leads to a run."""
     folder = results / "paper"
@@ -76,7 +80,7 @@ def write_tables(results):
     axes = [{"axis": name, "title": name, "group": "geometry", "unit": "units"} for name in ("wires", "gap")]
     cell = {"mark": "", "full": "0.1 (0.05 to 0.2)", "shade": 0.4, "status": "ok", "reason": ""}
     ray = {"command": "python -m bench.ray task=stability stress=wires renderer=dist", "breaks": 0.5, "works": None}
-    cell |= {"folder": "completion-0002", "ray": ray}
+    cell |= {"folder": "completion-0002", "ray": ray, "pictures": {"breaks": DOT, "breaks_text": "fails at 0.2"}}
     lost = cell | {"mark": "–", "shade": None, "status": "unsupported", "folder": "gone"}
     lost |= {"reason": "no alpha"}
     atlas = {"axes": axes, "rows": ["dist", "dvr"], "cells": [[cell, lost], [cell, None]]}
@@ -384,6 +388,8 @@ def test_a_cell_of_the_atlas_opens_its_curve_and_its_run(results, tab):
     assert page.locator(".opened a").get_attribute("href") == "#/run/completion-0002"
     command = "python -m bench.ray task=stability stress=wires renderer=dist level=0.5"
     assert page.locator(".opened .code pre").all_text_contents() == [command]
+    assert page.locator(".thumbnails figcaption").all_inner_texts() == ["fails at 0.2"]
+    assert page.locator(".thumbnails img").evaluate("image => image.naturalWidth") == 1
     page.keyboard.press("ArrowRight")
     page.keyboard.press("Enter")
     assert "no alpha Its run is not among these results." in page.locator(".opened").inner_text()

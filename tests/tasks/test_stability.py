@@ -1,14 +1,18 @@
 """Breakdowns known in closed form are found, planted faults move them, and a user's renderer is in the atlas."""
 
+from base64 import b64decode
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from bench.config import load
 from bench.machine.limits import Limits
-from bench.records.record import RunStatus
+from bench.records.record import Record, RunStatus
+from bench.tasks.stability import picture
 from bench.tasks.stability.search import SearchSettings
 from bench.tasks.stability.task import Stability
 from renderers import IDR
@@ -22,13 +26,17 @@ AGGRESSIVE = {"coarse_to_fine": False, "careful_split": False, "extra_step_cap":
 
 
 def run(folder: Path, stress: str, renderer, *, resolution: int = 24) -> dict:
-    """The record's metrics of a search, beside "status"."""
+    """The metrics of a search."""
+    return record_of(folder, stress, renderer, resolution).metrics
+
+
+def record_of(folder: Path, stress: str, renderer, resolution: int = 24) -> Record:
     folder.mkdir(exist_ok=True)
     run = run_of(folder, renderer, ball_prior(), camera_of(8))
     small = SearchSettings(levels=5, repeats=2)
     Stability(stress_named(stress), SEARCH, small, CRITERIA, SHORT, resolution, Limits(1e8, 8)).execute(run)
     assert run.record.status is RunStatus.OK
-    return run.record.metrics
+    return run.record
 
 
 def within(stress: str, metrics: dict, severity: float) -> bool:
@@ -113,17 +121,30 @@ def test_success_that_rises_with_severity_is_noted(tmp_path):
         assert any(note.startswith("success does not fall with severity") for note in run.record.notes) is doubted
 
 
-def test_a_run_leaves_its_trials_and_the_picture_of_the_first_failure(tmp_path):
-    metrics = run(tmp_path, "empty_scene", load("renderer", "idr", epsilon=1e-3))
-    lines = curve_of(tmp_path)
-    assert len(lines) == metrics["trials"]
-    assert sum(not line["success"] for line in lines) == metrics["failed_false"] > 0
-    mildest = min(line["level"] for line in lines if not line["success"])
-    with np.load(tmp_path / "images.npz") as images:
-        assert images["kinds"].shape == images["true_distance"].shape == (24, 24)
-        assert (images["kinds"] == 3).sum() > 0
-        assert images["severity"] == pytest.approx(next(x["severity"] for x in lines if x["level"] == mildest))
+def test_a_run_shows_both_sides_of_its_breakdown(tmp_path):
+    record = record_of(tmp_path, "thin_plate", CAPPED)
+    lines, level = curve_of(tmp_path), record.metrics["level"]
+    assert len(lines) == record.metrics["trials"]
+    works = [line["severity"] for line in lines if line["success"] and line["level"] <= level]
+    breaks = [line["severity"] for line in lines if not line["success"] and line["level"] >= level]
+    with np.load(tmp_path / "images.npz") as images:  # a thinner plate is severer
+        assert images["works_severity"] == pytest.approx(min(works))
+        assert images["breaks_severity"] == pytest.approx(max(breaks))
+        missed = {name: (images[f"{name}_kinds"] == 2).sum() for name in ("works", "breaks")}
+        assert images["breaks_true_distance"].shape == (24, 24)
+    assert missed["breaks"] > missed["works"]
     assert (tmp_path / "failure.png").stat().st_size > 5000
+    assert "(missed)" in record.pictures["breaks_text"]
+    small = Image.open(BytesIO(b64decode(record.pictures["breaks"].removeprefix("data:image/png;base64,"))))
+    assert (np.asarray(small) == 2).sum() == missed["breaks"]
+
+
+def test_a_small_picture_keeps_single_wrong_pixels():
+    kinds = np.ones((130, 129), np.uint8)
+    kinds[7, 128] = 4
+    uri = picture._thumbnail(kinds)
+    small = np.asarray(Image.open(BytesIO(b64decode(uri.partition(",")[2]))))
+    assert small.shape == (44, 43) and small[2, 42] == 4 and (small == 4).sum() == 1
 
 
 def test_a_task_without_a_stress_names_the_remedy():

@@ -18,7 +18,7 @@ PICTURE_TEXTS = {
     "input.png": "What was given",
     "outline.png": "The part of each pixel that the shape covers: result, truth and difference",
     "distances.png": "Mesh and truth, coloured by the distance to the other",
-    "failure.png": "The first failure: kinds of pixels, beside the true distance",
+    "failure.png": "Both sides of the breakdown: distances, true distances, kinds of errors",
 }
 
 

@@ -1,34 +1,69 @@
-"""The picture of a stress test: the first failed rendering."""
+"""The pictures of a stress test: a rendering that succeeds and one that fails, on both sides of the breakdown."""
 
+from base64 import b64encode
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
+from matplotlib.colors import ListedColormap, to_rgb
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Patch
+from PIL import Image
 
 from bench.pictures.style import BOTH, MISSED, PAPER, SCREEN, SPURIOUS, bare, save
+from bench.tasks.stability.trial import Trial
 
 # Colours of kinds of pixels; images.npz stores the index of the kind. Names for readers, if different.
 PIXELS = {"background": PAPER, "right": BOTH, "lost": MISSED, "false": SPURIOUS, "wrong surface": "#f2a600"}
 PIXEL_NAMES = {"lost": "missed", "false": "spurious"}
+MAX_THUMBNAIL_PIXELS = 64  # per side
 
 
 @rc_context(SCREEN)
-def draw_failure(folder: Path, images: dict[str, np.ndarray], severity: float, title: str) -> None:
-    """Writes images.npz and failure.png: rendered and true distances, and the kind of error of each pixel.
+def draw_breakdown(folder: Path, trials: list[Trial], unit: str, title: str) -> dict[str, str]:
+    """Writes images.npz and failure.png: distances, true distances and kinds of errors, a line per trial.
 
     Args:
-        images: "distance", "true_distance" and "kinds", an index into `PIXELS` for each pixel; all [height, width].
+        trials: with images "distance", "true_distance" and "kinds", an index into `PIXELS` for each pixel.
+        unit: of the severity.
+
+    Returns:
+        "works" and "breaks", the kinds of errors as a small PNG in a data URI; "works_text" and "breaks_text".
     """
-    np.savez_compressed(folder / "images.npz", severity=severity, **images)  # type: ignore[arg-type]
-    figure = Figure(figsize=(9.2, 3.6), layout="constrained")
+    names = ["works" if trial.outcome.success else "breaks" for trial in trials]
+    arrays = {
+        f"{name}_{key}": image
+        for name, trial in zip(names, trials, strict=True)
+        for key, image in {"severity": np.float64(trial.severity), **trial.outcome.images}.items()
+    }
+    np.savez_compressed(folder / "images.npz", **arrays)  # type: ignore[arg-type]
+    texts = [_text(trial, unit) for trial in trials]
+    figure = Figure(figsize=(9.2, 3.6 * len(trials) + 0.3), layout="constrained")
+    lines = figure.subfigures(len(trials), 1, squeeze=False)[:, 0]
+    for line, text, trial in zip(lines, texts, trials, strict=True):
+        line.suptitle(text, fontsize=10)
+        _draw_line(line, trial.outcome.images)
+    figure.suptitle(title)
+    save(figure, folder / "failure.png")
+    pictures = [_thumbnail(trial.outcome.images["kinds"]) for trial in trials]
+    return dict(zip(names, pictures, strict=True)) | {f"{k}_text": text for k, text in zip(names, texts, strict=True)}
+
+
+def _text(trial: Trial, unit: str) -> str:
+    severity = f"{trial.severity:.3g} {unit}"
+    if trial.outcome.success:
+        return f"succeeds at {severity}"
+    kind = str(trial.outcome.failure)
+    return f"fails at {severity} ({PIXEL_NAMES.get(kind, kind)})"
+
+
+def _draw_line(figure: SubFigure, images: dict[str, np.ndarray]) -> None:
     rendered_axis, true_axis, kinds_axis = figure.subplots(1, 3)
     true_distance = images["true_distance"]
     finite = true_distance[np.isfinite(true_distance)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    for axis, name, heading in ((rendered_axis, "distance", "found"), (true_axis, "true_distance", "truth")):
+    for axis, name, heading in ((rendered_axis, "distance", "rendered"), (true_axis, "true_distance", "truth")):
         shown = axis.imshow(images[name], cmap="viridis", vmin=low, vmax=max(high, low + 1e-6))
         axis.set_title(f"distance along the ray, {heading}")
         bare(axis)
@@ -40,5 +75,15 @@ def draw_failure(folder: Path, images: dict[str, np.ndarray], severity: float, t
     colours = {PIXEL_NAMES.get(name, name): PIXELS[name] for name in names}
     patches = [Patch(facecolor=colour, edgecolor="#888888", label=name) for name, colour in colours.items()]
     kinds_axis.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, frameon=False)
-    figure.suptitle(title)
-    save(figure, folder / "failure.png")
+
+
+def _thumbnail(kinds: np.ndarray) -> str:
+    """A PNG of at most 64 x 64 pixels in a data URI; each pixel has the largest index of the pixels that it covers."""
+    factor = -(-max(kinds.shape) // MAX_THUMBNAIL_PIXELS)
+    padded = np.pad(kinds, [(0, -side % factor) for side in kinds.shape])
+    height, width = (side // factor for side in padded.shape)
+    image = Image.fromarray(padded.reshape(height, factor, width, factor).max(axis=(1, 3)), mode="P")
+    image.putpalette([round(255 * channel) for colour in PIXELS.values() for channel in to_rgb(colour)])
+    file = BytesIO()
+    image.save(file, "PNG", optimize=True)
+    return f"data:image/png;base64,{b64encode(file.getvalue()).decode()}"

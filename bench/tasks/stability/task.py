@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from bench.setup.inputs import RunContext, RunInputs
 from bench.tasks.stability import fit, judge
 from bench.tasks.stability.axes import Stress
 from bench.tasks.stability.distortions import NETWORK_DISTORTIONS
-from bench.tasks.stability.picture import PIXEL_NAMES, draw_failure
+from bench.tasks.stability.picture import draw_breakdown
 from bench.tasks.stability.search import Bisection, Search, SearchSettings
 from bench.tasks.stability.trial import Conditions, Criteria, Failure, FitSettings, Trial
 from datasets.scene import HasNetwork
@@ -72,7 +73,7 @@ class Stability:
             raise BadInput("the network has no code that the stress far_code could change: set stress=noisy_weights")
 
     def execute(self, run: RunContext) -> None:
-        """Searches; fills the record, writes a line per trial to curve.jsonl, and draws the mildest failure."""
+        """Searches; fills the record, writes a line per trial to curve.jsonl, and draws both sides of the breakdown."""
         record, renderer = run.record, run.inputs.renderer
         prior = run.inputs.prior if self.stress.needs_prior else None
         conditions = Conditions(self.resolution, self.fit, self.criteria, self.limits, run.inputs.device, prior)
@@ -93,11 +94,9 @@ class Stability:
         record.evaluations = {"per_ray": record.metrics["evaluations_per_ray"]}
         record.status, record.reason = trials.status()
         record.notes = [*record.notes, *trials.warnings()]
-        if trials.first_failure is not None:
-            failure, subject = trials.first_failure, f"{record.name}, {record.scene}"
-            kind = PIXEL_NAMES.get(failure.outcome.failure or "", failure.outcome.failure)
-            title = f"{subject}: first failure ({kind}) at {failure.severity:.3g} {self.stress.sweep.unit}"
-            draw_failure(run.folder, failure.outcome.images, failure.severity, title)
+        if around := trials.around(search.result().level):
+            title = f"{record.name}, {record.scene}"
+            record.pictures = draw_breakdown(run.folder, around, self.stress.sweep.unit, title)
 
     def _check(self, renderer: Renderer) -> None:
         """Raises Unsupported before the first trial if the renderer rejects the setting at the mild end."""
@@ -132,17 +131,21 @@ class Stability:
 
 @dataclass
 class _Trials:
-    """All trials of a search, and the mildest failure with images."""
+    """All trials of a search, and those that its pictures may show, with images."""
 
     all: list[Trial] = field(default_factory=list)
-    first_failure: Trial | None = None
+    with_images: list[Trial] = field(default_factory=list)
 
     def add(self, trial: Trial) -> None:
-        """Stores a trial; images only of the mildest failure."""
-        has_images = bool(trial.outcome.images) and not trial.outcome.success
-        if has_images and (self.first_failure is None or trial.level < self.first_failure.level):
-            self.first_failure = trial
+        self.with_images += [trial] if trial.outcome.images else []
         self.all.append(replace(trial, outcome=replace(trial.outcome, images={})))
+
+    def around(self, level: float) -> list[Trial]:
+        """The severest success up to this level, and the mildest failure from it on; either may be missing."""
+        works = [trial for trial in self.with_images if trial.outcome.success and trial.level <= level]
+        breaks = [trial for trial in self.with_images if not trial.outcome.success and trial.level >= level]
+        by_level = attrgetter("level")
+        return [*([max(works, key=by_level)] if works else []), *([min(breaks, key=by_level)] if breaks else [])]
 
     def status(self) -> tuple[RunStatus, str]:
         """The status of the run and its reason: crashed if every trial raised an error."""

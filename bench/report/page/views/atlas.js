@@ -1,4 +1,4 @@
-/* The atlas of breakdowns: a cell per axis and renderer; a cell opens its curve and its first failure beside the truth. */
+/* The atlas of breakdowns: a cell per axis and renderer; a cell opens its curve, and pictures of both sides of its breakdown. */
 (function (bench) {
   "use strict";
 
@@ -72,13 +72,24 @@
       element("h2", null, `${axis.title}, ${row}`),
       element("p", null, `Breakdown: ${words(result)}. ${result.reason || ""} `,
         isListed ? element("a", {href: bench.runs.link(run)}, "The run") : soft("Its run is not among these results.")),
+      thumbnails(result.pictures || {}),
       rays(result.ray || {}),
       later(curves(), (panels) => {
         const panel = panels.find((each) => each.axis === axis.axis);
         return panel && bench.chart({panels: [panel]}, {label: `Share of successes on ${axis.title}`, focus: row});
       }),
-      isListed && later(bench.runs.detail(run), failure));
+      isListed && later(bench.runs.detail(run), large));
     if (getComputedStyle(opened).position !== "sticky") opened.scrollIntoView({block: "nearest"});
+  }
+
+  /* The kinds of errors in a rendering that succeeds, and in one that fails. */
+  function thumbnails(pictures) {
+    const shown = ["works", "breaks"].filter((name) => pictures[name]);
+    const figures = shown.map((name) => element("figure", null,
+      element("img", {src: pictures[name], alt: `Errors of a rendering that ${pictures[`${name}_text`]}`}),
+      element("figcaption", null, pictures[`${name}_text`])));
+    if (!figures.length) return null;
+    return [element("div.thumbnails", null, figures), soft("Grey: right hits, red: missed, blue: spurious, orange: another surface.")];
   }
 
   /* The commands that draw the ray of the most wrong pixel, where the renderer breaks and where it does not. */
@@ -94,9 +105,9 @@
     return data && data.chart ? data.chart.panels : [];
   }
 
-  function failure({pictures}) {
+  function large({pictures}) {
     const result = pictures.find(([name]) => name === "failure.png");
-    if (!result) return soft("This run has no picture of a failure.");
+    if (!result) return soft("This run has no picture of its breakdown: fits and gradients have none.");
     const [, src, alt] = result;
     return element("figure", null, element("img.figure", {src, alt}), element("figcaption", null, alt));
   }
