@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import sys
+from functools import partial
 from pathlib import Path
 
 from bench.report.suite.standing import units
@@ -35,22 +36,24 @@ def wrongs(text: str) -> list[str]:
 def recommendation() -> str:
     """README's first answer: the row with the most progress among those that none beats significantly at any cost."""
     lines = _lines("suite")
-    leaders = {budget: [line for line in lines if _first_rank(line, budget)] for budget in _decided_budgets()}
+    leaders = {
+        budget: sorted(filter(partial(_leads, budget), lines), key=lambda line: -float(line[budget]))
+        for budget in _decided_budgets()
+    }
     always = [line for line in lines if all(line in rows for rows in leaders.values())]
     if not always:
         raise ValueError("no row is among the best at all costs: README needs another sentence")
     first = max(always, key=lambda line: float(line[_decided_budgets()[-1]]))
     sentences = [
-        f"At {units(float(budget))} of cost{_sets(budget)}, no renderer makes significantly more progress than "
-        f"{_either(rows)}. "
-        f"Of these, `{max(rows, key=lambda line: float(line[budget]))['preset']}` makes the most."
+        f"At {units(float(budget))} of cost{_sets(budget)}, {_listed(rows)} {'lead' if rows[1:] else 'leads'}."
         for budget, rows in leaders.items()
     ]
     is_hardest, best = first["row"] in _hardest(), _hardest()[0].partition(",")[0]
     hard = "cannot be distinguished from the best" if is_hardest else f"is significantly worse than that of {best}"
     return (
         f"**Start with `{first['preset']}`.** All renderers spend the same number of field evaluations. "
-        f"{' '.join(sentences)}\n"
+        f"{' '.join(sentences)} A renderer leads if none makes significantly more progress. "
+        f"The first name has the most.\n"
         f"On [hard scenes](results/paper/stability_cost.md), the mean rank of `{first['preset']}` {hard}."
     )
 
@@ -64,7 +67,7 @@ def _budgets() -> list[str]:
 def _decided_budgets() -> list[str]:
     """The budgets at which some renderers are significantly worse than others."""
     lines = _lines("suite")
-    return [budget for budget in _budgets() if not all(_first_rank(line, budget) for line in lines if line[budget])]
+    return [budget for budget in _budgets() if not all(_leads(budget, line) for line in lines if line[budget])]
 
 
 def _sets(budget: str) -> str:
@@ -74,13 +77,14 @@ def _sets(budget: str) -> str:
     return next(heading for heading in headings if re.fullmatch(rf"{when}( \(.*)?", heading)).removeprefix(when)
 
 
-def _first_rank(line: dict[str, str], budget: str) -> bool:
+def _leads(budget: str, line: dict[str, str]) -> bool:
+    """Whether no row makes significantly more progress."""
     return re.split(r"\D", line[f"{budget}_rank"])[0] == "1"
 
 
-def _either(lines: list[dict[str, str]]) -> str:
+def _listed(lines: list[dict[str, str]]) -> str:
     names = [f"`{line['preset']}`" for line in lines]
-    return " or ".join([", ".join(names[:-1]), names[-1]]) if names[1:] else names[0]
+    return " and ".join([", ".join(names[:-1]), names[-1]]) if names[1:] else names[0]
 
 
 def table() -> str:
@@ -97,10 +101,10 @@ def table() -> str:
 
 
 def _progress(line: dict[str, str], budget: str) -> str:
-    """Bold if no row makes significantly more progress."""
+    """Bold if it leads."""
     if not line[budget]:
         return line[f"{budget}_rank"] or "not run"
-    is_leader = budget in _decided_budgets() and _first_rank(line, budget)
+    is_leader = budget in _decided_budgets() and _leads(budget, line)
     return f"**{_percent(line[budget])}**" if is_leader else _percent(line[budget])
 
 
