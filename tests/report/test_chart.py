@@ -51,6 +51,15 @@ def test_intervals_are_a_band_around_a_line_and_bars_of_points():
     assert band.get_paths()[0].vertices[:, 1].max() == 40
 
 
+@pytest.mark.parametrize("positions", [[1, 2], [1, 16]], ids=["linear", "logarithmic"])
+def test_many_lines_have_bars_next_to_each_other(positions):
+    axis = axis_of(*(curve(name, "dist", positions, KNOWN) for name in "abcde"))
+    bars = np.array([[segment[0, 0] for segment in bar.get_segments()] for bar in axis.collections])
+    assert all(isinstance(bar, LineCollection) for bar in axis.collections)
+    assert (np.diff(bars, axis=0) > 0).all() and bars[2].tolist() == pytest.approx(positions)
+    assert bars[-1, 0] < 1.2 and [line.get_xdata().tolist() for line in axis.lines] == bars.tolist()
+
+
 def test_without_an_interval_the_points_of_the_shapes_are_drawn():
     made = series("a", "dist", [7], FEW)
     assert "low" not in made and made["shapes"] == [[7, 1], [7, 3]]

@@ -15,6 +15,8 @@ from bench.report.data.statistics import Interval, dominated
 from bench.report.suite.attempts import CUSTOM
 
 REFERENCE_COLOUR = "#777777"
+MAX_BANDS, MAX_BARS = 4, 6  # more lines have bars in place of bands, if each has few points
+BAR_STEP = 0.011  # between the bars of two lines, as a fraction of the width
 Series = dict[str, Any]
 Panel = dict[str, Any]
 
@@ -137,8 +139,11 @@ def _edge(panels: Sequence[Panel], letter: str) -> float:
 
 
 def _panel(axis: Axes, panel: Panel, edge: float) -> None:
-    for each in _shown(panel):
-        _series(axis, each, [_edge([panel], "x"), edge], across="rows" in panel)
+    banded = [each for each in _shown(panel) if {"dash", "low"} <= each.keys()]
+    as_bars = len(banded) > MAX_BANDS and max(len(each["x"]) for each in banded) <= MAX_BARS
+    shifted = _side_by_side(banded, log=panel["x"]["log"]) if as_bars else banded
+    for each in [*(each for each in _shown(panel) if each not in banded), *shifted]:
+        _series(axis, each, [_edge([panel], "x"), edge], across="rows" in panel, bars=as_bars)
     for letter in "xy":
         if panel[letter]["log"]:
             style.log_axis(axis, letter, _drawn(panel, letter))
@@ -152,10 +157,22 @@ def _panel(axis: Axes, panel: Panel, edge: float) -> None:
     axis.set(title=panel["title"], xlabel=panel["x"]["title"], ylabel=panel["y"]["title"])
 
 
-def _series(axis: Axes, each: Series, edges: list[float], *, across: bool) -> None:
+def _side_by_side(all_series: Sequence[Series], *, log: bool) -> list[Series]:
+    """The series, moved along x so that their bars do not overlap."""
+    forward, back = (np.log, np.exp) if log else (np.asarray, np.asarray)
+    positions = [forward(each["x"]) for each in all_series]
+    step = BAR_STEP * np.ptp(np.concatenate(positions))
+    middle = (len(all_series) - 1) / 2
+    moved = [back(x + (index - middle) * step) for index, x in enumerate(positions)]
+    return [each | {"x": x} for each, x in zip(all_series, moved, strict=True)]
+
+
+def _series(axis: Axes, each: Series, edges: list[float], *, across: bool, bars: bool) -> None:
     """Draws a series: intervals as a band or bars, infinite values at the edge, infinite points as crosses.
 
-    Intervals are along x if `across`.
+    Args:
+        across: whether intervals are along x.
+        bars: whether the intervals of a line are bars.
     """
     x, y, line = np.minimum(each["x"], edges[0]), np.minimum(each["y"], edges[1]), "dash" in each
     style_options: dict[str, Any] = {"color": each["colour"], "marker": each["symbol"], "ls": each.get("dash", "none")}
@@ -169,7 +186,7 @@ def _series(axis: Axes, each: Series, edges: list[float], *, across: bool) -> No
         axis.plot(x[is_infinite], y[is_infinite], "x", color=each["colour"])
     if "low" in each:
         ends = [np.minimum(each[end], edges[not across]) for end in ("low", "high")]
-        if line:
+        if line and not bars:
             axis.fill_between(x, *ends, color=each["colour"], alpha=0.15, lw=0)
         elif across:
             axis.hlines(y, *ends, color=each["colour"], lw=1)
