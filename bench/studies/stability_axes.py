@@ -23,6 +23,7 @@ AXES_NOTES = (
     "the distance, and the kinds of failed trials.",
     breakdowns.SUCCESS,
 )
+MIN_CORRELATED = 5  # renderers: with fewer, no correlation is significant
 COST_NOTES = (
     "An axis is a kind of stress. The axes are those of renderings, without settings that some renderer lacks. Rank 1 "
     "is the best, and equal breakdowns share their mean rank. A failed or missing run has the worst rank, and so has a "
@@ -101,7 +102,7 @@ def make_cost(runs: Runs) -> Result:
         "Robustness over cost.",
         "Mean rank of a renderer's breakdowns, over its median of field evaluations per ray at the mildest severity.",
         question="Do robust renderers cost more field evaluations?",
-        verdict=f"{ends} {_alike(ranks)}".strip(),
+        verdict=f"{_related(lines['cost'], means)} {ends} {_alike(ranks)}".strip(),
         n=f"{shared['axis'].nunique()} axes and {len(lines)} renderers",
         remarks=COST_NOTES,
         columns=COST_COLUMNS,
@@ -139,6 +140,16 @@ def make_curves(runs: Runs) -> Result:
         data=data,
         chart={"panels": panels},
     )
+
+
+def _related(costs: pd.Series, ranks: pd.Series) -> str:
+    """A sentence on the correlation of ranks and costs; empty with few renderers."""
+    both = costs.notna() & ranks.notna()
+    rho, p = statistics.rank_correlation(costs[both], ranks[both]) if both.sum() >= MIN_CORRELATED else (math.nan, 1.0)
+    if math.isnan(rho):
+        return ""
+    answer = "No significant correlation" if p >= statistics.ALPHA else "Yes" if rho < 0 else "No, they cost fewer"
+    return f"{answer}: Spearman's correlation of rank and cost is *{rho:.2f}* (p = {p:.2g}, {both.sum()} renderers)."
 
 
 def _alike(ranks: dict[str, statistics.Interval]) -> str:

@@ -15,6 +15,7 @@ from bench.report.data.statistics import (
     interquartile_mean,
     median,
     rank,
+    rank_correlation,
     ratio,
     ratio_verdicts,
     shapes_agreeing,
@@ -327,3 +328,14 @@ def test_a_shape_may_have_views_and_its_runs_another_statistic_than_the_geometri
     assert ratio(doubled, groups, of_shape=median).points == (2.0, 2.0)
     ones = [[np.array([1.0, 1.0]), np.array([1.0])], groups[1]]
     assert ratio(groups, ones, of_shape=median).points == (2.0, 1.0)  # one failed run of three leaves it finite
+
+
+def test_the_rank_correlation_is_spearman_s():
+    draw = np.random.default_rng(0)
+    for n in (5, 12, 40):
+        first = draw.integers(0, 9, n)  # with equal values
+        second = first + draw.integers(0, 9, n)
+        expected = stats.spearmanr(first, second)
+        assert rank_correlation(first, second) == pytest.approx((expected.statistic, expected.pvalue))
+    assert rank_correlation([1, 2, 3, 4], [9, 5, 4, 1]) == (-1, 0)
+    assert math.isnan(rank_correlation([1, 1, 1], [1, 2, 3])[0])

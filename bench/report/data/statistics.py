@@ -272,6 +272,15 @@ def _mean_interval(values: np.ndarray) -> Interval:
     return bootstrap([*values[:, None]], lambda drawn: np.mean(drawn, axis=-1))
 
 
+def rank_correlation(first: Values, second: Values) -> tuple[float, float]:
+    """Spearman's correlation, and its two-sided p value by Student's t approximation; NaN without variation."""
+    ranks = [pd.Series(np.asarray(values)).rank() for values in (first, second)]
+    rho, freedom = float(ranks[0].corr(ranks[1])), len(ranks[0]) - 2
+    with np.errstate(divide="ignore"):  # at a correlation of 1
+        t = abs(rho) * np.sqrt(freedom / (1 - np.float64(rho) ** 2))
+    return rho, 2 * float(special.stdtr(freedom, -t)) if freedom > 0 else math.nan
+
+
 def tied_with_best(ranks: dict[Any, Interval], best: Any) -> list[Any]:
     """The other methods that cannot be distinguished from the best: the interval of the rank difference contains 0."""
     best_points = np.array(ranks[best].points)
