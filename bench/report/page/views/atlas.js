@@ -89,7 +89,7 @@
       element("img", {src: pictures[name], alt: `Errors of a rendering that ${pictures[`${name}_text`]}`}),
       element("figcaption", null, pictures[`${name}_text`])));
     if (!figures.length) return null;
-    return [element("div.thumbnails", null, figures), soft("Grey: right hits, red: missed, blue: spurious, orange: another surface.")];
+    return [element("div.thumbnails", null, figures), element("p", null, soft("Grey: right hits. Red: missed. Blue: spurious. Orange: another surface."))];
   }
 
   /* The commands that draw the ray of the most wrong pixel, where the renderer breaks and where it does not. */
