@@ -32,6 +32,8 @@ NETWORK_FORMS = "network_LAYERSxWIDTH, fourier_LAYERSxWIDTH, hash_LEVELSxLOG2ENT
 FORMS = f"task=reconstruction takes {NETWORK_FORMS}, occupancy_WIDTH or grid_N"
 HASH_WIDTH = 64  # neurons per layer of a hash grid's networks, as in Mueller et al. 2022
 VALIDATION_STEP = 8  # the trials do not learn from every 8th input photograph: it measures their error
+# Errors after 40 iterations do not predict which size ends best; after 80 they mostly do (six validation shapes).
+MIN_TRIAL_ITERATIONS = 80
 DEFINITIONS = {
     "field": "the field that field=auto ended on",
     "field_free, field_stored, field_bytes": "the numbers of its field and its colours, all of which are learnt, and "
@@ -101,7 +103,7 @@ class AutoField:
 
     Args:
         candidates: names of fields, each once, in any order; see `Appearance.make`.
-        trial: fraction of the iterations.
+        trial: fraction of the iterations, which are at least `MIN_TRIAL_ITERATIONS`.
         patience: number of successive larger candidates that may be tried without improvement.
     """
 
@@ -119,7 +121,7 @@ class AutoField:
     def choose(
         self, make: Make, sizes: dict[str, int], subject: Subject, settings: OptimiserSettings, run: RunContext
     ) -> "Choice":
-        """Tries candidates from the smallest to larger ones, and chooses by `bench.tasks.capacity.growth.climb`.
+        """Tries candidates from the smallest to larger ones, by `bench.tasks.capacity.growth.climb`.
 
         Errors are measured on input photographs that the trials do not learn from, in groups of tiles: at the end of a
         trial, and after half of it, which shows whether the error still falls. A trial whose optimisation fails has no
@@ -135,7 +137,8 @@ class AutoField:
         fitted = tuple(shot for index, shot in enumerate(subject.input_shots) if index % VALIDATION_STEP)
         trial_subject = replace(subject, input_shots=fitted)
         pixels = Stack.build(validation, None, device).pixels
-        iterations, budget = max(round(self.trial * settings.iterations), 1), settings.budget
+        iterations, budget = max(round(self.trial * settings.iterations), MIN_TRIAL_ITERATIONS), settings.budget
+        iterations = min(iterations, settings.iterations)
         trial_settings = replace(settings, iterations=iterations, budget=budget and self.trial * budget)
 
         def trial(name: str, trials: Trials) -> Evidence:
@@ -175,7 +178,12 @@ class Choice:
 
     @property
     def kept(self) -> Evidence:
-        return self.trials.kept[-1]
+        """The candidate with the least error while that still falls; then the smallest that no larger one improves on.
+
+        A short trial cannot show that a small field suffices: the longer a run, the further its error is behind.
+        """
+        least = min(self.trials.tried, key=lambda trial: trial.mean)
+        return least if least.falling else self.trials.kept[-1]
 
     @property
     def seconds(self) -> float:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bench.solve.optimise import OptimiserSettings
-from bench.tasks.capacity.growth import _is_better, climb
+from bench.tasks.capacity.growth import Trials, _is_better, climb
 from bench.tasks.capacity.model import Evidence, Size
 from bench.tasks.capacity.observations import TILES_PER_SIDE
 from bench.tasks.reconstruction.choice import AutoField, Choice, tiled
@@ -18,14 +18,14 @@ from renderers import IDR
 from renderers.field import Counts
 from tests.tiny import ball_prior, camera_of, run_of
 
-SETTINGS = OptimiserSettings(40, 0.1, "constant")
+SETTINGS = OptimiserSettings(320, 0.1, "constant")
 
 
 @dataclass
 class FixedError:
     """A problem with `free` parameters and a fixed error on validation photographs; it records its loss calls.
 
-    Half-way through the ten iterations of a trial, the error is larger by `falls`.
+    Half-way through the 80 iterations of a trial, the error is larger by `falls`.
     """
 
     free: int
@@ -44,7 +44,7 @@ class FixedError:
         return {"total": self.parameters[0].square().sum() + (torch.nan if self.failing else 1.0)}
 
     def colour_errors(self, pixels: Any) -> torch.Tensor:
-        error = self.wrong + (self.falls if len(self.calls) < 8 else 0.0)
+        error = self.wrong + (self.falls if len(self.calls) < 60 else 0.0)
         return torch.full((len(pixels.depth_per_distance),), error)
 
 
@@ -54,7 +54,7 @@ def shot(name: str) -> Shot:
 
 
 def chosen(
-    problems: dict[str, FixedError], folder, *, patience: int = 2, photographs: int = 9
+    problems: dict[str, FixedError], folder, *, patience: int = 2, photographs: int = 9, settings=SETTINGS
 ) -> tuple[Choice, list[Subject]]:
     shots, subjects = tuple(shot(str(number)) for number in range(photographs)), []
     subject = Subject(shots, (shot("held out"),), None, "")
@@ -66,7 +66,7 @@ def chosen(
     run = run_of(folder, IDR, ball_prior(), camera_of(16))
     auto = AutoField(tuple(problems), 0.25, patience)
     sizes = {name: problem.free for name, problem in problems.items()}
-    return auto.choose(make, sizes, subject, SETTINGS, run), subjects
+    return auto.choose(make, sizes, subject, settings, run), subjects
 
 
 def test_the_smallest_candidate_that_no_larger_one_improves_on_is_chosen(tmp_path):
@@ -78,7 +78,7 @@ def test_the_smallest_candidate_that_no_larger_one_improves_on_is_chosen(tmp_pat
         assert [photograph.name for photograph in fitted.input_shots] == ["1", "2", "3", "4", "5", "6", "7"]
     assert choice.validation_count == 2
     for problem in problems.values():
-        assert problem.calls == [0, *range(10)]  # one warm-up, then a quarter of 40
+        assert problem.calls == [0, *range(80)]  # one warm-up, then a quarter of 320
     assert "field=auto: middle, 10 numbers; error of colours on 2 photographs set aside" in choice.note
     assert "small 0.3, middle 0.1, large 0.1" in choice.note
     metrics = choice.metrics(runtime=2 * choice.seconds)
@@ -86,6 +86,21 @@ def test_the_smallest_candidate_that_no_larger_one_improves_on_is_chosen(tmp_pat
     names = ("field", "field_free", "field_bytes", "fields_tried")
     assert [metrics[name] for name in names] == ["middle", 10, 40, 3]
     assert metrics["field_error"] == pytest.approx(0.1)
+
+
+def test_the_least_error_is_chosen_while_it_still_falls(tmp_path):
+    noisy = {"a": of_tiles(np.full(16, 0.3)), "b": of_tiles(np.tile([0.1, 0.49], 8))}
+    trials = Trials([*noisy.values()], [noisy["a"]])
+    assert Choice(trials, 1).kept is noisy["a"]  # "b" is better, but within the noise
+    noisy["b"].falling = True
+    assert Choice(trials, 1).kept is noisy["b"]
+
+
+@pytest.mark.parametrize(("iterations", "trial"), [(400, 100), (200, 80), (40, 40)])
+def test_trials_are_long_enough_to_show_an_order(tmp_path, iterations, trial):
+    problem = FixedError(3, 0.3)
+    chosen({"a": problem}, tmp_path, settings=OptimiserSettings(iterations, 0.1, "constant"))
+    assert len(problem.calls) == 1 + trial
 
 
 def test_candidates_that_are_no_better_are_skipped_until_patience_ends(tmp_path):
