@@ -25,7 +25,6 @@ class MLflow:
         _check_installed("mlflow", f"MLflow: {install_command('mlflow')}")
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
-        """Makes a run in MLflow with the status FINISHED if the run ended ok, else FAILED."""
         from mlflow import MlflowClient, entities  # slow to import, and needed only here
 
         client = MlflowClient(tracking_uri=self.uri)
@@ -61,7 +60,6 @@ class TensorBoard:
         _check_installed("tensorboard", f"TensorBoard: {install_command('tensorboard')}")
 
     def export(self, folder: Path, record: dict[str, Any]) -> None:
-        """Writes the curve, the final values and the settings of the run."""
         from torch.utils.tensorboard import SummaryWriter  # slow to import, and needed only here
 
         with SummaryWriter(str(Path(self.folder) / record["id"])) as writer:
@@ -80,7 +78,6 @@ def _check_installed(module: str, remedy: str) -> None:  # before the run, not a
 
 
 def settings(config: dict[str, Any]) -> dict[str, str]:
-    """A configuration as dotted keys and strings."""
     return {key: str(value) for key, value in flat(config).items()}
 
 

@@ -81,7 +81,6 @@ class Recipe:
 
     @property
     def row(self) -> str:
-        """The name of the row: the label, a star and the commit."""
         return f"{self.label} ★ {self.commit[:COMMIT_DIGITS_IN_ROW]}"
 
 
@@ -101,22 +100,13 @@ def read_recipe(path: str | Path) -> Recipe:
 
 @dataclass(frozen=True)
 class External(PhotographTask):
-    """Runs a code of others on the input photographs, and evaluates its mesh on the held-out ones.
+    """Runs a code of others on the input photographs, and evaluates its mesh on the held-out ones."""
 
-    Args:
-        images, longest, held_out, masks, depths: see `PhotographTask`.
-        path: file of the recipe.
-        code: folder of the code, a git checkout.
-        python: the program {python} of recipes; None: .venv/bin/python in `code`.
-        container: words before each command, in place of the recipe's; None: the recipe's.
-        time_limit: seconds of all commands; None: the recipe's.
-    """
-
-    path: str | None = None
-    code: str | None = None
-    python: str | None = None
-    container: list[str] | None = None
-    time_limit: float | None = None
+    path: str | None = None  # of the recipe
+    code: str | None = None  # its folder, a git checkout
+    python: str | None = None  # the program {python} of recipes; None: .venv/bin/python in `code`
+    container: list[str] | None = None  # words before each command; None: the recipe's
+    time_limit: float | None = None  # seconds of all commands; None: the recipe's
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput if the recipe is missing or invalid, or the code is not at the recipe's commit."""
@@ -145,11 +135,7 @@ class External(PhotographTask):
             subject.finish(run)
 
     def mesh_of(self, recipe: Recipe, shots: Sequence[Shot], work: Path) -> Mesh:
-        """Exports photographs to the folder `work`, runs the commands, and returns their mesh in the unit sphere.
-
-        Raises:
-            CodeFailed: a command fails or takes too long, or there is no mesh.
-        """
+        """Exports photographs to `work`, runs the commands, and returns their mesh in the unit sphere."""
         work, code, started = work.resolve(), Path(self.code or "").resolve(), time.time()
         values = {"work": work, "code": code, "count": len(shots), "python": self.python or code / ".venv/bin/python"}
 
@@ -179,15 +165,9 @@ class External(PhotographTask):
 
 
 def _run(words: list[str], log: Path, deadline: float, options: dict[str, Any]) -> int:
-    """Runs a command, whose output is added to a file; returns its exit status, negative after a signal.
+    """Runs a command, whose output is added to a file, to a deadline in seconds since 1970; returns its exit status.
 
-    Args:
-        deadline: in seconds since 1970.
-        options: further arguments of `subprocess.Popen`.
-
-    Raises:
-        CodeFailed: it cannot be started.
-        subprocess.TimeoutExpired: at the deadline; it and its children are ended, as after any other exception.
+    It and its children are ended by TimeoutExpired and other exceptions; raises CodeFailed if it cannot be started.
     """
     options = {"stdin": subprocess.DEVNULL, "stderr": subprocess.STDOUT, "start_new_session": True, **options}
     with log.open("ab") as output:

@@ -48,10 +48,7 @@ JUDGE_TASK = "judge"  # the task of rows without --like
 
 @dataclass(frozen=True)
 class Item:
-    """A mesh, and the truth: a file, the number of a scan or the name of a scene.
-
-    The mesh is None if no mesh has the name of the truth.
-    """
+    """A mesh, None if none has the truth's name; and the truth: a file, the number of a scan or the name of a scene."""
 
     name: str
     mesh: Path | None
@@ -77,29 +74,16 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Judge:
-    """The settings for judging meshes.
+    """The settings for judging meshes."""
 
-    Args:
-        dtu_folder: the folder of DTU; None for other truths.
-        threshold: threshold of the F-score, in units or, with %, in per cent of the truth's extent.
-        points: number of points sampled on each surface.
-        seed: seed of the samples.
-        unit_sphere: whether both are moved like the mesh of a run: the centre of the truth's box to the origin, scaled
-            into a sphere of `SPHERE_RADIUS`.
-        to_world: folder of photographs; meshes are moved from their unit sphere into the world of their cameras.
-        cull: folder of photographs whose masks cull meshes.
-        tanks_folder: the folder of Tanks and Temples; None for other truths.
-        tanks_settings: how its scans are compared.
-    """
-
-    dtu_folder: Path | None
-    threshold: str
-    points: int
+    dtu_folder: Path | None  # None for other truths
+    threshold: str  # of the F-score, in units or, with %, in per cent of the truth's extent
+    points: int  # sampled on each surface
     seed: int
-    unit_sphere: bool
-    to_world: Path | None
-    cull: Path | None
-    tanks_folder: Path | None = None
+    unit_sphere: bool  # move both like the mesh of a run: the box's centre to the origin, scaled into `SPHERE_RADIUS`
+    to_world: Path | None  # photographs; meshes are moved from their unit sphere into the world of their cameras
+    cull: Path | None  # photographs whose masks cull meshes
+    tanks_folder: Path | None = None  # None for other truths
     tanks_settings: tanks.TanksSettings = tanks.PUBLISHED
 
     def __post_init__(self) -> None:
@@ -115,11 +99,7 @@ class Judge:
             raise ValueError(f"--threshold must be a positive number, such as 0.02 or 1%, not {self.threshold}")
 
     def verdict(self, item: Item) -> Verdict:
-        """Judges a mesh.
-
-        Raises:
-            ValueError, OSError: if files cannot be read, or nothing can be compared.
-        """
+        """Judges a mesh; raises ValueError or OSError if files cannot be read, or nothing can be compared."""
         if item.mesh is None:
             raise ValueError(f"no mesh is named '{item.name}', as {item.truth} is")
         if isinstance(item.truth, str):
@@ -176,7 +156,6 @@ class Judge:
         return kept.moved(capture.to_world)
 
     def _by_surface(self, name: str, mesh: Mesh, truth: Path) -> Verdict:
-        """The surface metrics against a file with a mesh or a point cloud."""
         cloud = read_points(truth)
         surface = None if cloud is not None else read_mesh(truth)
         truth_points = surface.used_vertices if surface is not None else cloud
@@ -219,11 +198,7 @@ def _photographs(folder: Path) -> Capture:
 
 
 def _frame_check(mesh: Mesh, truth: Float[np.ndarray, "n 3"], *, is_partial: bool) -> tuple[list[str], bool]:
-    """A warning if a mesh is probably in another world or in other units than its truth; whether a change fits.
-
-    Args:
-        is_partial: whether the mesh may have more than was scanned.
-    """
+    """A warning if a mesh, or a part of it, is probably in other units or another world; whether a change fits."""
     comparison = coincidence.compare_surfaces(mesh, truth, is_partial=is_partial)
     warning = (
         f"warning: {comparison.text('the mesh', 'the truth')}: are both in the same world and units? The mesh of a run "
@@ -233,14 +208,7 @@ def _frame_check(mesh: Mesh, truth: Float[np.ndarray, "n 3"], *, is_partial: boo
 
 
 def items_of(mesh: Path, truth: Path | None, truth_of: Callable[[str], int | str]) -> list[Item]:
-    """The meshes to judge: a mesh, a run's mesh, or the meshes of a folder, paired with truths by their names.
-
-    Args:
-        truth_of: the scan or the scene of a mesh's name, if `truth` is None.
-
-    Raises:
-        ValueError: if meshes and truths do not fit.
-    """
+    """The meshes of a file, run or folder, with truths of their names; raises ValueError if these do not fit."""
     name = mesh.stem
     if (mesh / "record.json").is_file():
         name, mesh = mesh.name, mesh / (WORLD_MESH_FILE if (mesh / WORLD_MESH_FILE).is_file() else "mesh.ply")
@@ -258,7 +226,6 @@ def items_of(mesh: Path, truth: Path | None, truth_of: Callable[[str], int | str
 
 
 def metric_units(judge: Judge) -> dict[str, str]:
-    """The unit of each metric."""
     if judge.dtu_folder is not None:
         return dict.fromkeys(dtu.METRIC_NAMES, "mm")
     if judge.tanks_folder is not None:
@@ -269,7 +236,6 @@ def metric_units(judge: Judge) -> dict[str, str]:
 
 
 def print_verdicts(verdicts: Sequence[Verdict], units: dict[str, str]) -> None:
-    """Prints a line per mesh, the medians of several meshes, and notes."""
     rows = [(verdict.name, verdict.metrics) for verdict in verdicts]
     names = [name for name in units if any(name in metrics for _, metrics in rows)]
     if len(rows) > 1:
@@ -290,12 +256,7 @@ def print_verdicts(verdicts: Sequence[Verdict], units: dict[str, str]) -> None:
 
 
 def write_row(verdict: Verdict, item: Item, index: int, judge: Judge, options: argparse.Namespace) -> None:
-    """Writes a verdict as the record of a run, which tables and the page show with the runs of renderers.
-
-    Args:
-        index: index of the mesh in its folder.
-        options: the command line: `into`, `method`, `picture`, and `like`, a run with the same problem.
-    """
+    """Writes a verdict as the record of a run, which tables and the page show with the runs of renderers."""
     method = re.sub(r"[^a-z0-9]+", "_", options.method.lower()).strip("_")
     settings = judge.row_settings(item.truth)
     if options.like is not None:
@@ -327,7 +288,6 @@ def write_row(verdict: Verdict, item: Item, index: int, judge: Judge, options: a
 
 
 def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
-    """Parses the command line."""
     parser = argparse.ArgumentParser(prog="python -m bench.judge", description=__doc__)
     parser.add_argument("mesh", type=Path, metavar="MESH", help="a mesh with faces, a run folder, or a folder of these")
     truth = parser.add_mutually_exclusive_group(required=True)
@@ -357,11 +317,7 @@ def parse_arguments(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def check_options(options: argparse.Namespace) -> None:
-    """Refuses options that do not fit each other.
-
-    Raises:
-        ValueError: the message says what to type instead.
-    """
+    """Raises ValueError for options that do not fit each other, with what to type instead."""
     is_folder = options.mesh.is_dir() and not (options.mesh / "record.json").is_file()
     if options.into is not None and not (options.method and is_plain_name(options.method)):
         raise ValueError("--into writes rows of a method: add --method NAME")
@@ -379,7 +335,6 @@ def check_options(options: argparse.Namespace) -> None:
 
 
 def picture_path(picture: Path | None, item: Item) -> Path | None:
-    """The file of a mesh's picture: the named file, or a file in the named folder."""
     is_file = picture is None or picture.suffix.lower() == ".png"
     return picture if is_file else picture / f"{item.name}.png"
 

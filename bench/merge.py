@@ -23,15 +23,10 @@ UNFINISHED = ("killed", "crashed", "refused")  # they rank below all other statu
 
 
 def merge(sources: list[Path], into: Path) -> tuple[list[str], list[str]]:
-    """Copies all runs and plans of the sources to `into`.
+    """Copies all runs and plans of the sources to `into`, without runs that have a link out of their results folder.
 
-    A run with a link that leads out of its results folder is not copied. A run with an unreadable record is copied.
-
-    Returns:
-        a line for each replaced run, and a message for each run that is not copied or cannot be read.
-
-    Raises:
-        ValueError: if a source is not a results folder, or is or contains `into`, or if `into` is a file.
+    Returns a line for each replaced run, and a message for each run that is not copied or cannot be read. Raises
+    ValueError for a source or an `into` that is wrong.
     """
     for source in sources:
         if not (source / "runs").is_dir() and not attempts_folder(source).is_dir():
@@ -120,11 +115,7 @@ def _rank(folder: Path) -> tuple[tuple[Any, ...], str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Merges; prints a line for each replaced run, warnings, and the report's path last.
-
-    Returns:
-        the exit status: 1 if a run is not copied or cannot be read, 2 if nothing can be merged.
-    """
+    """Merges; prints a line for each replaced run, warnings, and the report's path last; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m bench.merge", description="Joins results folders.")
     parser.add_argument("sources", nargs="+", type=Path, metavar="FOLDER", help="results folders to join")
     parser.add_argument("--into", required=True, type=Path, metavar="FOLDER", help="where all of them go; may exist")

@@ -28,7 +28,6 @@ MAX_NAMED_PHOTOGRAPHS = 5
 
 
 def describe_fit(fit: MaskFit, capture: Capture) -> list[str]:
-    """Lines on the fit of the visual hull."""
     overlaps = fit.overlaps
     median, order = float(np.median(overlaps)), np.argsort(overlaps)
     lines = [f"the visual hull and the masks overlap by {median:.0%} (median; {GOOD_OVERLAP:.0%} and more is good)"]
@@ -71,7 +70,6 @@ def draw(capture: Capture) -> Figure:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the command line; returns 0 if the photographs can be used."""
     parser = argparse.ArgumentParser(prog="python -m bench.photos", description=__doc__)
     parser.add_argument("folder", type=Path, help="with photographs and their cameras, see datasets/README.md")
     parser.add_argument("--longest", type=int, default=128, help="pixels of the longer side (default: %(default)s)")

@@ -28,7 +28,6 @@ def train(run: PlannedRun) -> None:
 
 
 def main() -> int:
-    """Runs the command line; returns the exit status."""
     return command_line(train)
 
 

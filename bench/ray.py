@@ -85,11 +85,7 @@ class Options:
 
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[Options, list[str]]:
-    """The options of this command, and the other arguments, which are those of `python -m bench`.
-
-    Raises:
-        ValueError: if an option cannot be read, or does not go with a run folder.
-    """
+    """The options of this command and the arguments of `python -m bench`; raises ValueError for a wrong option."""
     values, others = dict[str, Any](), list[str]()
     for argument in arguments:
         key, _, text = argument.partition("=")
@@ -114,11 +110,7 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[Options, list[str]]:
 
 
 def run_of(folder: Path) -> PlannedRun:
-    """The run of a folder.
-
-    Raises:
-        OSError, ValueError: if it cannot be read, or is of another task.
-    """
+    """The run of a folder; raises OSError or ValueError if it cannot be read, or is of another task."""
     if not (folder / "record.json").is_file():
         raise ValueError(f"{folder} has no record.json: name the folder of a run, RESULTS/runs/NAME")
     if link := bad_link(folder, folder.parent):
@@ -132,11 +124,7 @@ def run_of(folder: Path) -> PlannedRun:
 
 
 def scene_of(cell: PlannedRun, task: Task, inputs: RunInputs, level: float | None) -> RayScene:
-    """The scene of a configuration, on the CPU.
-
-    Raises:
-        ValueError: if it has no field to render.
-    """
+    """The scene of a configuration, on the CPU; raises ValueError if it has no field to render."""
     if isinstance(task, Stability):
         return _stress_scene(cell.dataset, task, inputs, DEFAULT_LEVEL if level is None else level)
     if level is not None:
@@ -172,10 +160,7 @@ def scene_of(cell: PlannedRun, task: Task, inputs: RunInputs, level: float | Non
 
 
 def _formula(family: Family, split: Split, index: int) -> tuple[Callable[[Iterable[Any]], Field], dict[str, float]]:
-    """A family's formula as a function of its parameters, and the parameters of a shape.
-
-    All shapes are moved and scaled as the mesh of this shape is.
-    """
+    """A family's formula as a function of its parameters, moved and scaled as the mesh of a shape; its parameters."""
     values = family.draw(split, index)
 
     def build(numbers: Iterable[Any]) -> Shape:
@@ -188,7 +173,6 @@ def _formula(family: Family, split: Split, index: int) -> tuple[Callable[[Iterab
 
 
 def _stress_scene(name: str, task: Stability, inputs: RunInputs, level: float) -> RayScene:
-    """The first trial of a stress at a level."""
     if not 0 <= level <= 1:
         raise ValueError(f"level={level:g} must be from 0, mild, to 1, severe")
     stress, severity = task.stress, task.stress.sweep.severity(level)
@@ -206,8 +190,7 @@ def _stress_scene(name: str, task: Stability, inputs: RunInputs, level: float) -
 def show(cells: list[PlannedRun], options: Options) -> None:
     """Renders a ray by the renderer of each configuration; prints sentences, and the path of the picture last.
 
-    Raises:
-        ValueError: if the configurations differ in more than the renderer, or a renderer cannot render the scene.
+    Raises ValueError if they differ in more than the renderer, or a renderer cannot render the scene.
     """
     for key in cells[0].config.keys() - {"renderer", "label"}:
         if any(cell.config.get(key) != cells[0].config[key] for cell in cells):
@@ -250,11 +233,7 @@ def save_worst(scene: RayScene, renderer: RendererOfCell, search: Search, folder
 def picture_of(
     scene: RayScene, pixel: Pixel, search: str, renderers: list[RendererOfCell], zoom: float | None
 ) -> RayPicture:
-    """The picture of the ray of a pixel.
-
-    Args:
-        search: how the pixel was chosen, in words.
-    """
+    """The picture of the ray of a pixel, which was chosen as the words `search` say."""
     ray, truth, panels = scene.ray(pixel, scene.camera), scene.true_ray(pixel), list[LanePanel]()
     true = None
     if truth.hit is not None:
@@ -279,7 +258,6 @@ def _title(cell: PlannedRun, cells: list[PlannedRun]) -> str:
 
 
 def result_of(lanes: list[Lane], truth: TrueRay) -> str:
-    """How many renderers agree with the reference, and which do not."""
     wrong = [lane.title.partition(" (")[0] for lane in lanes if not lane.agrees(truth)]
     limit, reference = f" within {truth.tolerance:.1g} scene units", "The reference has no hit: "
     right = f"{len(lanes) - len(wrong)} of {plural(len(lanes), 'renderer')} right"
@@ -299,7 +277,6 @@ def window_of(lanes: list[Lane], truth: TrueRay, zoom: float | None) -> tuple[fl
 
 
 def _save(picture: RayPicture, into: Path) -> None:
-    """Writes the picture as PNG and PDF, and prints the path of the PNG."""
     name = into.name.removesuffix(".png").removesuffix(".pdf")
     figure, path = picture.draw(), into.with_name(f"{name}.png")
     try:
@@ -312,7 +289,6 @@ def _save(picture: RayPicture, into: Path) -> None:
 
 
 def main() -> int:
-    """Runs the command line; returns the exit status, 2 for a wrong command line."""
     try:
         options, arguments = parse_arguments(sys.argv[1:])
         if options.run is not None:

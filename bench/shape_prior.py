@@ -96,7 +96,6 @@ class PriorSettings:
 
     @property
     def of_one_shape(self) -> bool:
-        """Whether it is no prior, but a network of one shape."""
         return self.shapes == 1
 
     @property
@@ -215,7 +214,6 @@ def train(samples: DistanceSamples, settings: PriorSettings, device: torch.devic
 def initialise_to_sphere(decoder: Decoder, radius: float) -> None:
     """Sets the weights so that the field is near the distance of a sphere (SAL, Atzmon and Lipman 2020)."""
     for index, layer in enumerate(decoder.hidden):
-        assert isinstance(layer, nn.Linear)
         nn.init.normal_(layer.weight, 0.0, sqrt(2.0 / layer.out_features))
         nn.init.zeros_(layer.bias)
         if index == 0:
@@ -229,7 +227,6 @@ def initialise_to_sphere(decoder: Decoder, radius: float) -> None:
 def prior_for(
     dataset: Dataset, settings: PriorSettings, priors_dir: Path, device: torch.device, progress: Report
 ) -> Prior:
-    """The prior of a dataset; see `prior_file`."""
     path = prior_file(dataset, settings, priors_dir, device, progress)
     try:
         tensors = load_file(path)
@@ -257,7 +254,6 @@ def prior_file(
 
 
 def find_prior(dataset: Dataset, settings: PriorSettings, priors_dir: Path) -> Path | None:
-    """The path of a dataset's prior, or None if it does not exist."""
     key = prior_key(dataset, settings)
     paths = [path for folder in (SHIPPED, priors_dir) for path in folder.glob(f"*-{key}.safetensors")]
     return paths[0] if paths else None

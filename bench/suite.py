@@ -70,7 +70,9 @@ def main(arguments: Sequence[str]) -> int:
         print(_expected_runtime(options, _renderers(overrides)))
         for title, keys in _sweeps(options, overrides):
             print(title, flush=True)
-            if (code := _sweep(keys)) not in FINISHED_EXIT_STATUSES:
+            sys.argv[1:] = ["-m", *keys]  # like `python -m bench -m`, in this process, without a page
+            code = command_line(run_one, lambda composer, config: run_sweep(composer, config, print_statuses))
+            if code not in FINISHED_EXIT_STATUSES:
                 return code
         return 0 if "plan=true" in map(str.lower, overrides) else print_standing(results_dir)
     except (ValueError, OSError) as error:
@@ -79,11 +81,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """The options of this command, with defaults, and the overrides that it passes on.
-
-    Raises:
-        ValueError: if a size, set or setting is unknown, or the suite states the key.
-    """
+    """The options of this command, with defaults, and the overrides that it passes on; or ValueError."""
     options, overrides = {"suite": "quick", "set": ",".join(suite().errors), "setting": "stated"}, list[str]()
     budgets = sorted({f"{budget:g}" for *_, budget in problems_of("core")})
     for argument in arguments:
@@ -117,11 +115,7 @@ def _renderers(overrides: list[str]) -> list[str]:
 
 
 def _expected_runtime(options: dict[str, str], presets: list[str]) -> str:
-    """The number of runs of one renderer, and their time for the fastest and slowest of shipped rows.
-
-    Args:
-        presets: of the rows; if none is shipped, all rows.
-    """
+    """The number of runs of one renderer, and their time for the fastest and slowest of these or all shipped rows."""
     shipped = [attempt for attempt in read_attempts(paper.SHIPPED)[0] if not attempt.second_start]
     shipped = [attempt for attempt in shipped if attempt.preset in presets] or shipped
     problems = {key[:2] for key in problems_of(options["suite"]) if key[0] in options["set"].split(",")}
@@ -148,16 +142,11 @@ def _expected_runtime(options: dict[str, str], presets: list[str]) -> str:
 
 
 def shipped_rows() -> set[str]:
-    """The names of the shipped rows."""
     return {attempt.row for attempt in read_attempts(paper.SHIPPED)[0] if not attempt.second_start}
 
 
 def _sweeps(options: dict[str, str], overrides: list[str]) -> list[tuple[str, list[str]]]:
-    """The title of each sweep and its overrides: one sweep per set, or with setting=tuned one per tuned method.
-
-    Raises:
-        ValueError: if no set has a tuned setting.
-    """
+    """The title of each sweep and its overrides, one per set or tuned method; or ValueError without a setting."""
     sets, sweeps = options["set"].split(","), list[tuple[str, list[str]]]()
     renderers = _renderers(overrides)
     others = [text for text in overrides if not text.startswith("renderer=")]
@@ -180,10 +169,7 @@ def _sweeps(options: dict[str, str], overrides: list[str]) -> list[tuple[str, li
 
 
 def _tuned_choices(set_name: str, renderers: list[str]) -> dict[str, list[str]]:
-    """The methods with a tuned setting for a set, of these renderers or of all, with the overrides that choose them.
-
-    A tuned setting is used with the silhouette loss with which it was tuned.
-    """
+    """The overrides that choose a tuned setting for a set and its loss, by method; of these renderers, or of all."""
     task, overrides = _chosen(read_yaml(CONF / "experiment" / f"{EXPERIMENT_PREFIX}{set_name}.yaml"))["task"], {}
     for method in (f"{TUNED_PREFIX}{name}" for name in names(f"{METHOD}/tuned")):
         chosen = _chosen(choice(METHOD, method))
@@ -201,12 +187,6 @@ def _chosen(node: dict[str, Any]) -> dict[str, str]:
         elif (name := base.removeprefix(f"/{METHOD}/")) in names(METHOD):
             choices |= _chosen(choice(METHOD, name))
     return choices
-
-
-def _sweep(keys: list[str]) -> int:
-    """Makes the runs of a sweep like `python -m bench -m`, in this process, without a page; returns the exit status."""
-    sys.argv[1:] = ["-m", *keys]
-    return command_line(run_one, lambda composer, config: run_sweep(composer, config, print_statuses))
 
 
 def print_standing(results_dir: Path) -> int:
@@ -229,7 +209,6 @@ def print_standing(results_dir: Path) -> int:
 
 
 def _print_rows(standing: Standing, local: set[str]) -> None:
-    """Prints the progress and possible ranks of each row at each budget, and the number of failed runs."""
     available = plural(len(standing.everything[KEY].drop_duplicates()), "problem")
     compared = plural(len(standing.complete[KEY].drop_duplicates()), "problem")
     print(f"progress on the {compared} that all rows have, of {available} with results; with possible ranks:")
@@ -256,7 +235,6 @@ def _print_rows(standing: Standing, local: set[str]) -> None:
 
 
 def _print_errors(standing: Standing, local_rows: set[str]) -> None:
-    """Prints the errors of the local runs."""
     best_errors = standing.complete.groupby(KEY)["final"].min()
     for run in standing.reached[standing.reached["row"].isin(local_rows)].itertuples():
         errors = f"initial error {number(run.initial)}, final error {number(run.final)}"

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from math import inf
 from pathlib import Path
@@ -57,11 +57,7 @@ class Choice:
         return read_yaml(self.path) if self.row is None else self.row
 
     def load(self) -> tuple[DictConfig, str | None]:
-        """The content as Hydra merges it, and the package of its keys.
-
-        Raises:
-            ValueError: if the file cannot be read, or that of an experiment or a method lacks its first line.
-        """
+        """The content as Hydra merges it, and the package of its keys; raises ValueError if it cannot be read."""
         if self.row is not None:
             look = (LOOK_KEY,) if self.package else ()  # it would become a key of the top level
             return OmegaConf.create({key: self.row[key] for key in self.row if key not in look}), self.package
@@ -85,11 +81,7 @@ _user_folders: list[Path] = []  # of this command
 
 
 def register_rows(folders: Sequence[Path] = ()) -> None:
-    """Lists the files and rows of conf and of the user's folders; this replaces the list of an earlier call.
-
-    Raises:
-        ValueError: if a table cannot be read, or a row or file of the user has the name of one of ours.
-    """
+    """Lists the files and rows of conf and of the user's folders, in place of the earlier list; raises ValueError."""
     _user_folders[:] = folders
     _choices.clear()
     _choices.update({group: {**choices} for group, choices in _conf_choices().items()})
@@ -109,16 +101,11 @@ def group_choices(group: str) -> dict[str, Choice]:
 
 
 def folders() -> list[Path]:
-    """The user's folders of configurations."""
     return [*_user_folders]
 
 
 def choices_of(folder: Path) -> dict[str, dict[str, Choice]]:
-    """The files and rows of a folder, by group and name.
-
-    Raises:
-        ValueError: if a table cannot be read.
-    """
+    """The files and rows of a folder, by group and name; raises ValueError if a table cannot be read."""
     groups: dict[str, dict[str, Choice]] = {group: {} for group in (*GROUP_OF_TABLE.values(), SPACE)}
     files = [*folder.glob("*/*.yaml"), *folder.glob("hydra/*/*.yaml"), *folder.glob(f"{METHOD}/*/*.yaml")]
     for path in sorted([*files, *(folder.glob("config.yaml") if folder == CONF else ())]):
@@ -142,21 +129,13 @@ def names(group: str) -> list[str]:
 
 
 def choice(group: str, name: str) -> Node:
-    """The keys of a file or a row of conf, without those of its bases; a method may be `tuned/NAME` or `space/NAME`.
-
-    Raises:
-        KeyError: if the choice does not exist.
-    """
+    """The keys of a file or a row of conf, without those of its bases; a method may be `tuned/NAME` or `space/NAME`."""
     group, _, name = f"{group}/{name}".rpartition("/")
     return _conf_choices()[group][name].content
 
 
 def read_yaml(path: Path) -> Node:
-    """The content of a YAML file, a mapping; read-only.
-
-    Raises:
-        ValueError: if it cannot be read.
-    """
+    """The content of a YAML file, a mapping; read-only. Raises ValueError if it cannot be read."""
     return _parse_mapping(path, _read_text(path))
 
 
@@ -250,21 +229,18 @@ def nearest(word: str, options: list[str]) -> str:
 
 def register_resolvers() -> None:
     """Registers the resolvers that values of the configuration use, such as `${rows:table1}`."""
-    OmegaConf.register_new_resolver("rows", _rows, replace=True)
-    OmegaConf.register_new_resolver("spaces", lambda *without: extension("spaces")(*without), replace=True)
-    OmegaConf.register_new_resolver("drawn", _drawn, replace=True)
-    OmegaConf.register_new_resolver("package_of", lambda path: path.split(".")[0], replace=True)
-    OmegaConf.register_new_resolver("stem_of", _stem_of, replace=True)
-    OmegaConf.register_new_resolver("prior_kind", _prior_kind, replace=True)
-    OmegaConf.register_new_resolver("class_of", lambda path: path.split(".")[-1], replace=True)
+    register = partial(OmegaConf.register_new_resolver, replace=True)
+    register("rows", _rows)
+    register("spaces", lambda *without: extension("spaces")(*without))
+    register("drawn", _drawn)
+    register("package_of", lambda path: path.split(".")[0])
+    register("stem_of", lambda path: "no file" if path is None else Path(path).stem)  # a task refuses no file
+    register("prior_kind", _prior_kind)
+    register("class_of", lambda path: path.split(".")[-1])
 
 
 def without_row_keys(renderer: dict[str, Any], choice: str) -> dict[str, Any]:
-    """A resolved `renderer` node without `_rows_`, its look, and a `_label_` that it inherits from a base.
-
-    Args:
-        choice: the name of its file or row.
-    """
+    """A resolved `renderer` node without `_rows_`, its look, and a `_label_` that its choice inherits from a base."""
     content = group_choices("renderer")[choice].content if choice in group_choices("renderer") else {}
     inherited = {LABEL_KEY} if "defaults" in content and LABEL_KEY not in content else set[str]()
     return {key: value for key, value in renderer.items() if key not in {ROWS_KEY, LOOK_KEY} | inherited}
@@ -296,10 +272,3 @@ def _prior_kind(dataset: str | None, default: str) -> str:
     if dataset is None:
         return default
     return str(choice("dataset", dataset).get("_prior_", "own") if dataset in names("dataset") else "own")
-
-
-def _stem_of(path: str | None) -> str:
-    """The name of a file without suffix, which distinguishes a row from the same row of another file."""
-    if path is None:
-        return "no file"  # the task refuses it
-    return Path(path).stem

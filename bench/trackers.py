@@ -16,5 +16,4 @@ class Tracker(Protocol):
 class Nothing:
     """The tracker that exports nothing."""
 
-    def export(self, folder: Path, record: dict[str, Any]) -> None:
-        """Does nothing."""
+    def export(self, folder: Path, record: dict[str, Any]) -> None: ...

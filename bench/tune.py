@@ -44,24 +44,14 @@ CHOSEN_TEXT = (
 
 @dataclass(frozen=True)
 class Tuning:
-    """The draws of one method.
-
-    Args:
-        method: the method whose settings were drawn.
-        label: its name for readers.
-        draws: the numbers of the draws.
-        settings: the drawn settings of each draw, by dotted key.
-        validation: the logarithms [draws, runs] of errors. A failed run has the largest finite error of any draw of any
-            method on its shape and seed.
-        failures: the number of validation runs of each draw that failed.
-    """
+    """The draws of one method."""
 
     method: str
-    label: str
-    draws: list[int]
-    settings: list[dict[str, Any]]
-    validation: np.ndarray
-    failures: np.ndarray
+    label: str  # for readers
+    draws: list[int]  # their numbers
+    settings: list[dict[str, Any]]  # of each draw, by dotted key
+    validation: np.ndarray  # logarithms [draws, runs] of errors; of a failed run, the largest of any draw and method
+    failures: np.ndarray  # validation runs of each draw that failed
 
     @property
     def scores(self) -> np.ndarray:
@@ -78,20 +68,12 @@ class Tuning:
         return int(self.order[0])
 
 
-def unfinished(runs: Runs) -> int:
-    return sum(record["status"] in UNFINISHED for record in runs.records)
-
-
 def metric_of(runs: Runs) -> str:
-    """The error that the draws of an experiment are chosen by."""
     return SELECTION_METRICS.get(runs.selection.experiment, CHAMFER)
 
 
 def tunings(runs: Runs) -> list[Tuning]:
-    """The methods of an experiment, on the draws and shapes that all of them have; empty without validation runs.
-
-    Test shapes are optional; if there are some, each draw must have all of them.
-    """
+    """The methods of an experiment, on the draws and shapes that all of them have; empty without validation runs."""
     ended = [record for record in runs.records if record["status"] not in UNFINISHED]
     by_method = grouped(ended, lambda record: record["method"])
     keys = sorted({run_key(record) for record in ended})
@@ -148,19 +130,13 @@ def _settings(records: list[Record], among: list[Record]) -> list[dict[str, Any]
 
 
 def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> list[str]:
-    """Writes a row per method of an experiment to a table; returns a line for each.
-
-    Other rows of the table stay.
-
-    Raises:
-        ValueError: if runs of the tuning are missing or have not ended, or the table is not a YAML file.
-    """
+    """Writes a row per method to a table, whose other rows stay; returns a line for each. Raises ValueError."""
     if path.suffix != ".yaml":
         raise ValueError(f"{path} is no table of settings: type --into conf/tuned.yaml")
     experiment = choose(read_records(results_dir)[0], SELECTIONS[name], results_dir)
     if experiment is None:
         raise ValueError(f"{results_dir} has no runs of the tuning: type python -m bench -m +experiment={name}")
-    if waiting := unfinished(experiment):
+    if waiting := sum(record["status"] in UNFINISHED for record in experiment.records):
         raise ValueError(
             f"{waiting} runs of the tuning have not ended: type the command of the sweep again, it goes on"
         )
@@ -176,23 +152,18 @@ def write(results_dir: Path, path: Path, *, name: str = TUNING.experiment) -> li
         if not is_plain_name(method.method):
             raise ValueError(f"runs name the method {method.method!r}, which is no name of a row: leave these runs out")
     settings = {method.method: method.settings[method.best] for method in methods}
-    new = {method.method: _origin_keys(method, experiment) | settings[method.method] for method in methods}
-    rows = (read_yaml(path) if path.is_file() else {}) | new
+    rows = dict(read_yaml(path)) if path.is_file() else {}
+    for method in methods:
+        origin = {"chosen": _chosen_text(method, experiment), "base": f"/method/{method.method}"}
+        rows[method.method] = origin | {"label": f"{method.label}, tuned"} | settings[method.method]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, HEADER + yaml.safe_dump(rows, sort_keys=False, width=LINE_WIDTH))
     texts = {row: ", ".join(f"{key} {number(x)}" for key, x in values.items()) for row, values in settings.items()}
     return left_out(experiment, methods) + [f"{path}: {row}: {text}" for row, text in texts.items()]
 
 
-def _origin_keys(method: Tuning, experiment: Runs) -> dict[str, Any]:
-    """The keys of a method's row that are not settings: how the settings were chosen, base and label."""
+def _chosen_text(method: Tuning, experiment: Runs) -> str:
     records = [record for record in experiment.records if record["method"].removeprefix(SPACE_PREFIX) == method.method]
-    chosen = _chosen_text(method, records, experiment)
-    return {"chosen": chosen, "base": f"/method/{method.method}", "label": f"{method.label}, tuned"}
-
-
-def _chosen_text(method: Tuning, records: list[Record], experiment: Runs) -> str:
-    """A sentence on the draws, the choice and the runs."""
     commits = {str(record["environment"].get("commit", "unknown"))[:9] for record in records if record["environment"]}
     name, metric = records[0]["method"], metric_of(experiment)
     return CHOSEN_TEXT.format(
@@ -209,12 +180,10 @@ def _chosen_text(method: Tuning, records: list[Record], experiment: Runs) -> str
 
 
 def _join_names(names: Iterable[Any]) -> str:
-    """The different names in one line."""
     return " and ".join(sorted({" ".join(str(name).split()) for name in names}))
 
 
 def main(arguments: list[str]) -> int:
-    """Writes the rows and prints a line for each."""
     parser = argparse.ArgumentParser(prog="python -m bench.tune", description=__doc__.split("\n\n")[1])
     parser.add_argument("--experiment", choices=SELECTIONS, default=TUNING.experiment, help="which sweep is read")
     parser.add_argument("--results", type=Path, default=Path(RESULTS), metavar="FOLDER", help="results folder")
@@ -222,9 +191,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--into", type=Path, metavar="FILE", help=into)
     options = parser.parse_args(arguments)
     try:
-        print(
-            "\n".join(write(options.results, options.into or options.results / "tuned.yaml", name=options.experiment))
-        )
+        into = options.into or options.results / "tuned.yaml"
+        print(*write(options.results, into, name=options.experiment), sep="\n")
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

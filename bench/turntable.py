@@ -52,15 +52,7 @@ def turntable_views(truth: Truth, frames: int, size: int) -> Iterator[View]:
 
 
 def turntable(mesh: Mesh, frames: int, size: int) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """The frames of a full turn of a mesh in the unit sphere: colours, normals and depth side by side.
-
-    Args:
-        mesh: a mesh without colours is shown grey.
-        size: the side of each part, in pixels.
-
-    Raises:
-        ValueError: if a number is out of range, or the mesh is too small to be seen.
-    """
+    """The frames of a full turn of a mesh: colours or grey, normals and depth side by side; raises ValueError."""
     if not 2 <= frames <= MAX_FRAMES:
         raise ValueError(f"--frames must be 2 to {MAX_FRAMES}, found {frames}; 36 is a good number")
     if not MIN_PIXELS <= size <= MAX_PIXELS:
@@ -91,18 +83,13 @@ def _depth_images(depths: list[Float[Tensor, "fine_height fine_width"]]) -> list
 
 
 def _downsample(image: Float[np.ndarray, "fine_height fine_width 3"]) -> UInt8[np.ndarray, "height width 3"]:
-    """The mean of each square of pixels."""
     height, width = image.shape[0] // SUPERSAMPLES, image.shape[1] // SUPERSAMPLES
     squares = image.reshape(height, SUPERSAMPLES, width, SUPERSAMPLES, 3)
     return (255 * squares.mean(axis=(1, 3))).round().astype(np.uint8)
 
 
 def mesh_of_run(folder: Path) -> Path:
-    """The mesh of a run folder.
-
-    Raises:
-        ValueError: if the run has no mesh; the message has its status and reason.
-    """
+    """The mesh of a run folder; raises ValueError if the run has none."""
     if (folder / "mesh.ply").is_file():
         return folder / "mesh.ply"
     try:

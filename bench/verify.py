@@ -49,7 +49,6 @@ class EvaluatesField(Protocol):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Prints a line per run; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m bench.verify", description=__doc__.splitlines()[0].split(": ")[1])
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="a run's folder, or a results folder")
     options = parser.parse_args(arguments)
@@ -66,11 +65,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run_folders(path: Path) -> list[Path]:
-    """The folder of a run, or those of all runs of a results folder.
-
-    Raises:
-        ValueError: if there are no runs.
-    """
+    """The folder of a run, or those of all runs of a results folder; raises ValueError if there are none."""
     folders = [path] if (path / "record.json").is_file() else run_folders(path)
     if not folders:
         raise ValueError(f"{path} has no record.json, and no runs: name a run's folder, or a results folder")
@@ -78,10 +73,7 @@ def _run_folders(path: Path) -> list[Path]:
 
 
 def _agrees(folder: Path) -> bool | None:
-    """Whether the recomputed metrics of a run agree with its record; prints a line on it.
-
-    None if there is nothing to compare.
-    """
+    """Whether the recomputed metrics of a run agree with its record, None if it has none; prints a line on it."""
     try:
         if link := bad_link(folder, folder.parent):
             raise BadInput(f"{link} is a link out of the folder")
@@ -115,18 +107,12 @@ def _agrees(folder: Path) -> bool | None:
 
 
 def _compared_metrics(metrics: dict[str, Any]) -> dict[str, float]:
-    """The metrics that can be compared."""
     return {name: x for name, x in metrics.items() if isinstance(x, int | float) and not EXCLUDED_METRICS.search(name)}
 
 
 @flushing_denormals()
 def _from_field(folder: Path, record: Record) -> tuple[dict[str, Any], torch.device]:
-    """The metrics of the stored field of a run, and the device that computed them.
-
-    Raises:
-        NothingToCompare: if the run has no field.
-        BadInput: if its field or its configuration cannot be used.
-    """
+    """The metrics of a run's stored field, and the device that computed them; raises NothingToCompare, BadInput."""
     if not (folder / FIELD_FILE).is_file():
         notes = [note for note in record.notes if FIELD_FILE in note]
         status = "" if record.status == RunStatus.OK else f" ({record.status}: {record.reason})"
@@ -147,7 +133,6 @@ def _relative_difference(first: float, second: float) -> float:
 
 
 def _changes(record: Record, environment: dict[str, Any]) -> list[str]:
-    """The differences in code and machine between a record and this process, as texts."""
     code = code_hash(record.config)
     differences = [f"the code differs: {record.code[:12]} then, {code[:12]} now"] if code != record.code else []
     for name in MACHINE_KEYS:

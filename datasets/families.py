@@ -49,7 +49,6 @@ class Family:
         check_fraction("dataset.radius", self.radius, "rays start on the unit sphere; 0.97 leaves a margin")
 
     def draw(self, split: Split, index: int) -> dict[str, float]:
-        """The parameters of a shape."""
         generator = np.random.default_rng(seed_of(split, index))
         return {name: float(generator.uniform(*bounds)) for name, bounds in self.ranges.items()}
 

@@ -72,7 +72,6 @@ class Mesh:
 
     @property
     def area(self) -> float:
-        """Area of the surface."""
         return float(np.linalg.norm(self.area_normals, axis=1).sum() / 2)
 
     @property
@@ -119,7 +118,6 @@ class Mesh:
         return np.bincount(self.parts, weights=(heights * self.area_normals).sum(axis=1) / 6)
 
     def compact(self) -> "Mesh":
-        """The mesh without unused vertices."""
         used, faces = np.unique(self.faces, return_inverse=True)
         colours = None if self.colours is None else self.colours[used]
         return replace(self, vertices=self.vertices[used], faces=faces.reshape(-1, 3), colours=colours)
@@ -143,7 +141,6 @@ class Mesh:
         return Mesh(np.array(loaded.vertices), np.array(loaded.faces), colours=colours)
 
     def save(self, path: str | Path) -> None:
-        """Writes a binary .ply file."""
         path = Path(path)
         if path.suffix.lower() != ".ply":
             raise ValueError(f"path: must end in .ply, found '{path.name}'; name it '{path.stem}.ply'")
@@ -325,15 +322,10 @@ def _between(bound: Float[np.ndarray, "n n n"], fall: float) -> Float[np.ndarray
     for odd in product((0, 1), repeat=3):
         bounds = bound
         for axis in np.flatnonzero(odd).tolist():
-            bounds = np.maximum(*_neighbours(bounds, axis))
+            before = (slice(None),) * axis  # the larger one of each pair of neighbours
+            bounds = np.maximum(bounds[(*before, slice(None, -1))], bounds[(*before, slice(1, None))])
         finer[tuple(slice(start, None, 2) for start in odd)] = bounds - fall * sqrt(sum(odd))
     return finer
-
-
-def _neighbours(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """The first and the second of each pair of neighbours along an axis."""
-    before = (slice(None),) * axis
-    return values[(*before, slice(None, -1))], values[(*before, slice(1, None))]
 
 
 def _lattice(stride: int) -> tuple[slice, slice, slice]:

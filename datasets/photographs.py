@@ -75,14 +75,15 @@ class Photography:
         return [replace(shot, covered=see_area(truth, shot.camera)[0]) for shot in taken] if areas else taken
 
     def take_from(self, truth: Truth, cameras: Sequence[Camera], *, seed: int) -> list[Shot]:
-        """Takes the photographs of a mesh with `cameras`; see `take`."""
         generator = np.random.default_rng([seed, 2])
         texture = make_texture(self.texture, self.texture_size, seed)
         taken = [self._take_one(str(index), truth, texture, camera, generator) for index, camera in enumerate(cameras)]
         for shot in taken:
             if shot.mask is None or not bool(shot.mask.any()):
                 raise BadInput(f"camera {shot.name} sees nothing of the shape: widen view.field_of_view or distance")
-        if max(_colour_spread(shot) for shot in taken) < MIN_COLOUR_SPREAD:
+        ends = torch.tensor([0.25, 0.75])  # outline pixels mixed with the background are ignored
+        quartiles = [shot.colours[shot.mask].quantile(ends, dim=0) for shot in taken]
+        if max(float((upper - lower).max()) for lower, upper in quartiles) < MIN_COLOUR_SPREAD:
             raise BadInput("the surface has one colour in all images: choose another texture or shading")
         return taken
 
@@ -112,12 +113,6 @@ class Photography:
         image = image + self.noise * generator.standard_normal(image.shape)
         colours, view = torch.from_numpy(image.clip(0, 1).astype(np.float32)), see(truth, camera)
         return Shot(name, camera, colours, view.mask, view.depth, view.normals)
-
-
-def _colour_spread(shot: Shot) -> float:
-    """The interquartile range of the colours on the shape, to ignore outline pixels mixed with the background."""
-    quartiles = shot.colours[shot.mask].quantile(torch.tensor([0.25, 0.75]), dim=0)
-    return float((quartiles[1] - quartiles[0]).max())
 
 
 def circle(first: Camera, count: int) -> list[Camera]:

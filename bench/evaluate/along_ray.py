@@ -86,10 +86,6 @@ class Lane:
     """What one renderer does on a ray; all distances are along the ray, in scene units.
 
     Args:
-        name: the preset, for its colour.
-        title: of its panel.
-        calls: distances of its field evaluations on the ray, call by call.
-        end: where it ends the ray.
         residual: the last field value.
         marches: whether it has a number of steps; the evaluations of other renderers are no steps.
         weights: sorted distances of a volume's samples, and their weights; None if it sums nothing.
@@ -106,7 +102,6 @@ class Lane:
 
     @property
     def evaluations(self) -> list[float]:
-        """The distances of all field evaluations in order."""
         return [distance for call in self.calls for distance in call]
 
     @property
@@ -116,7 +111,6 @@ class Lane:
 
     @property
     def hit(self) -> float | None:
-        """The distance of its hit, if there is one."""
         return self.end if self.status is Status.HIT else None
 
     def agrees(self, truth: TrueRay) -> bool:
@@ -231,7 +225,6 @@ def _on_samples(lane: Lane, truth: TrueRay, hit: float) -> str:
 
 
 def _samples(lane: Lane) -> str:
-    """The number of samples and their spacing."""
     gaps = np.diff(lane.samples)
     average = " on average" if np.ptp(gaps) > gaps.mean() else ""
     return f"{len(lane.samples)} samples, {_length(gaps.mean())} apart{average},"
@@ -260,7 +253,6 @@ def _on_weights(lane: Lane, truth: TrueRay, hit: float) -> str:
 
 
 def _ending(lane: Lane, truth: TrueRay) -> str:
-    """The sentence on where a ray ended."""
     where = f"at {lane.end:.4g}" if truth.hit is None else _offset(lane.end - truth.hit)
     if lane.status is Status.MISS:
         return "It missed."

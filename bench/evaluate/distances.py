@@ -41,7 +41,6 @@ class Distances:
 
     @property
     def extent(self) -> float:
-        """The diagonal of the box of the truth's points."""
         return float(np.linalg.norm(np.ptp(self.truth, axis=0)))
 
     def shares(self, limits: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], ...]:

@@ -67,10 +67,8 @@ class Derivatives:
     """Derivatives of the hit distance towards the most sensitive parameters, per unit of the parameter.
 
     Args:
-        indices, names: of the parameters.
         true: by central differences of the reference; nan where the hit jumps within a step.
         computed: by the renderer's gradient; empty without one.
-        missing: why the renderer has none.
     """
 
     indices: list[int]
@@ -110,7 +108,6 @@ class Derivatives:
 
     @property
     def sentences(self) -> str:
-        """The derivatives and the verdict."""
         if not self.computed:
             return self.missing
         return f"Derivatives of the distance (of the reference): {', '.join(self.pairs)}. {self.verdict}".strip()

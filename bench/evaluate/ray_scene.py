@@ -102,7 +102,6 @@ class RayScene:
         return TOLERANCE_PIXELS / float(self.camera.intrinsics[0, 0])
 
     def true_ray(self, pixel: Pixel) -> TrueRay:
-        """The truth on the ray of a pixel."""
         ray = self.ray(pixel, self.camera.double())
         return true_ray(self.exact, ray, lipschitz=self.lipschitz, tolerance=self.tolerance)
 

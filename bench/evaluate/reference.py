@@ -67,7 +67,6 @@ def trace_exactly(field: Field, rays: Rays, lipschitz: float) -> Rendering:
 
 
 def fingerprint(prior: Prior) -> str:
-    """A hash of a prior's weights and codes."""
     weights = hashlib.sha256()
     for tensor in (*prior.decoder.state_dict().values(), prior.codes):
         weights.update(tensor.cpu().contiguous().numpy().tobytes())

@@ -21,7 +21,6 @@ class State:
 
     Args:
         field: must not change later. Its evaluations are not counted.
-        inputs: of the run.
     """
 
     field: Field
@@ -39,7 +38,6 @@ class State:
 
     @cached_property
     def raycaster(self) -> Truth | None:
-        """The mesh, for ray casting."""
         return None if self.mesh is None else Truth(self.mesh, closed=False)
 
     @property

@@ -32,12 +32,7 @@ DEFINITIONS = {
 
 
 def note_colours(run: RunContext, state: State) -> None:
-    """Notes the sizes of code, mesh and texture, and writes colours.png and, for galleries, images.npz.
-
-    Args:
-        run: with a scene that has a texture, and a prior with colours.
-        state: the final state, with the field of the code.
-    """
+    """Notes the sizes of code, mesh and texture of a run, and writes colours.png and, for galleries, images.npz."""
     inputs, prior, scene = run.inputs, run.inputs.prior, run.inputs.scene
     texels = getattr(scene.texture, "texels", None) or len(scene.mesh.vertices)
     run.record.metrics |= {
@@ -78,7 +73,6 @@ def picture_arrays(render: RenderColours, camera: Camera, largest: int) -> dict[
 
 
 def view_arrays(render: RenderColours, camera: Camera, prefix: str = "") -> dict[str, Tensor]:
-    """The colours, normals and hits of a camera's view, by names with a prefix."""
     view, image = render(camera)
     arrays = {"colours": image, "normals": picture_normals(view), "hit": view.mask}
     return {prefix + name: array for name, array in arrays.items()}

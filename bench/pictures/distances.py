@@ -35,12 +35,7 @@ COLOURS = colormaps["turbo"].with_extremes(over="#5a5a5a")
 
 @rc_context(SCREEN)
 def draw_distances(distances: Distances, title: str, path: Path, dense: Distances | None = None) -> None:
-    """Writes a picture, and its curves as a .csv file of the same name.
-
-    Args:
-        distances: of the curves.
-        dense: distances of more points, which are coloured in place of the measured ones.
-    """
+    """Writes a picture and its curves, also as .csv; `dense`, of more points, is coloured in place of `distances`."""
     figure = Figure(figsize=(10.2, 6.6), layout="constrained")
     figure.suptitle(title)
     grid = figure.add_gridspec(2, 3, width_ratios=(1, 1, 1.25))
@@ -72,7 +67,6 @@ def _curve_limits(distances: Distances) -> Float[np.ndarray, " k"]:
 
 
 def _draw_curves(axis: Axes, distances: Distances) -> None:
-    """The shares of points that are closer than a distance, and the threshold with its three scores."""
     limits = _curve_limits(distances)
     precision, recall, _ = distances.shares(limits)
     axis.plot(limits, 100 * precision, color="#c1121f", label="mesh to truth (precision)")
@@ -127,11 +121,7 @@ def _camera_axes(distances: Distances, azimuth_degrees: float) -> Float[np.ndarr
 def _splat(
     pixels: Float[np.ndarray, "n 3"],
 ) -> tuple[Int[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """The index of the nearest point in each pixel, -1 without one, and its depth. Points are disks.
-
-    Args:
-        pixels: to the right, down and away, from the middle of the picture.
-    """
+    """The index of the nearest point in each pixel, -1 without one, and its depth. Points are disks."""
     index, depth = np.full((PIXELS, PIXELS), -1), np.full((PIXELS, PIXELS), np.inf)
     order = np.argsort(-pixels[:, 2])  # of points on one pixel, the last one written remains: the nearest
     column, row = np.floor(pixels[order, :2] + PIXELS / 2).astype(np.int64).T

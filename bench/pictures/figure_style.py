@@ -42,8 +42,6 @@ RC = {
 
 @dataclass(frozen=True)
 class Look:
-    """The colour, marker and line of a row in every figure."""
-
     colour: str
     marker: str
     line: str = "-"
@@ -67,10 +65,7 @@ def look(preset: str) -> Look:
 
 
 def _settings_of(name: str) -> Node:
-    """The keys `colour`, `marker` and `line` of a method or renderer, merged over those of its bases; {} for others.
-
-    A method has the colour of its renderer. Its tuned settings, and its space, look like the method.
-    """
+    """The keys of `LOOK_KEY`, merged over those of its bases; {} for others. A tuned method looks like the method."""
     name = name.rpartition("/")[2]
     group = METHOD if name in names(METHOD) else "renderer"
     candidates = [name, *(other for other in names("renderer") if other.replace("_", "") == name)]  # or a class name

@@ -29,17 +29,11 @@ LAST_FRAME_SECONDS = 1.5
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture of a shape: its view, and its colours if it has any.
+    """A picture of a shape."""
 
-    Args:
-        view: with the mask for the comparison of silhouettes.
-        colours: of all pixels.
-        has_mask: whether the mask is known.
-    """
-
-    view: View
-    colours: Float[Tensor, "height width 3"] | None = None
-    has_mask: bool = True
+    view: View  # with the mask for the comparison of silhouettes
+    colours: Float[Tensor, "height width 3"] | None = None  # of all pixels
+    has_mask: bool = True  # whether the mask is known
 
     def pictures(self, truth: "Shown") -> dict[str, Float[np.ndarray, "height width 3"]]:
         """Pictures by the names of their rows. Colours and the silhouette error are included if the truth has them."""
@@ -53,7 +47,6 @@ class Shown:
         return pictures
 
     def enlarged(self, camera: Camera) -> "Shown":
-        """The same pixels in the size of a camera."""
         colours = None if self.colours is None else in_size(self.colours, camera)
         return Shown(enlarged(self.view, camera), colours, self.has_mask)
 
@@ -62,21 +55,12 @@ class Filmstrip:
     """Collects frames of a run, unless pictures are off."""
 
     def __init__(self, inputs: RunInputs, over: str = "after iterations"):
-        """Starts without frames.
-
-        Args:
-            over: meaning of the frames' names, for the title.
-        """
+        """Starts without frames; `over` is the meaning of their names, for the title."""
         self.inputs, self.over = inputs, over
         self.frames: dict[int | str, Shown] = {}
 
     def add(self, name: int | str, state: State, camera: Camera | None = None) -> None:
-        """Adds a frame that shows the mesh of a state at the resolution of pictures.
-
-        Args:
-            name: its label, such as an iteration.
-            camera: of the frame; None for the scene's.
-        """
+        """Adds a frame that shows the mesh of a state, from a camera or the scene's, at the resolution of pictures."""
         if self.inputs.evaluation.picture is not None:
             camera = self.inputs.scene.view.camera if camera is None else camera
             view = refined_view(state, at_size(camera, self.inputs.evaluation.picture))
@@ -86,9 +70,8 @@ class Filmstrip:
     def save(self, folder: Path, title: str, chosen: str | None = None, truth: Shown | None = None) -> None:
         """Writes strip.png into a run folder, and film.gif or film.webp if requested.
 
-        Args:
-            chosen: name of the frame of the run's result, if it is not the last: it is shown, with its name in bold.
-            truth: the picture for comparison; None for the scene's shape in its view.
+        `chosen` names the frame of the result, if it is not the last. `truth`, for comparison, is by default the
+        scene's.
         """
         if not self.frames:
             return
@@ -102,7 +85,11 @@ class Filmstrip:
         strip = _strip(self._selected_frames(chosen), {name: true}, f"{title}; {self.over}", chosen)
         save(strip, folder / "strip.png")
         if self.inputs.evaluation.film is not None:
-            _animate(folder / f"film.{self.inputs.evaluation.film}", list(self.frames.values()), true)
+            shown = [np.concatenate(list(frame.pictures(true).values()), axis=1) for frame in self.frames.values()]
+            first, *others = [Image.fromarray((255 * picture).astype(np.uint8)) for picture in shown]
+            durations = [round(1000 * FRAME_SECONDS)] * len(others) + [round(1000 * LAST_FRAME_SECONDS)]
+            path = folder / f"film.{self.inputs.evaluation.film}"
+            first.save(path, save_all=True, append_images=others, duration=durations, loop=0)
 
     def _selected_frames(self, chosen: str | None) -> dict[int | str, Shown]:
         """Evenly spaced frames and the chosen one. A checkpoint one iteration before the last is left out."""
@@ -141,10 +128,3 @@ def _strip(frames: dict[int | str, Shown], last_column: dict[str, Shown], title:
         axis.xaxis.get_major_ticks()[list(frames).index(chosen)].label2.set_fontweight("bold")
     figure.suptitle(f"{title}{' (red missed, blue spurious)' if SILHOUETTE_ROW in rows else ''}")
     return figure
-
-
-def _animate(path: Path, frames: list[Shown], truth: Shown) -> None:
-    pictures = [np.concatenate(list(frame.pictures(truth).values()), axis=1) for frame in frames]
-    images = [Image.fromarray((255 * picture).astype(np.uint8)) for picture in pictures]
-    durations = [round(1000 * FRAME_SECONDS)] * (len(images) - 1) + [round(1000 * LAST_FRAME_SECONDS)]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=durations, loop=0)

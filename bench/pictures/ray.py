@@ -45,34 +45,23 @@ class LanePanel:
 
     @property
     def sentences(self) -> str:
-        """The sentences on the lane and on its derivatives."""
         return f"{self.text} {self.derivatives.sentences}" if self.derivatives else self.text
 
 
 @dataclass(frozen=True)
 class RayPicture:
-    """What the picture shows.
+    """What the picture shows."""
 
-    Args:
-        scene: the scene and the pixel, in words.
-        result: of all renderers, in words.
-        field: the input of the renderers.
-        rays: the ray, [1, 3].
-        window: the distances at the ends of the field's panel and of the lanes.
-        lanes: one per renderer.
-    """
-
-    scene: str
-    result: str
-    field: Field
-    rays: Rays
+    scene: str  # the scene and the pixel, in words
+    result: str  # of all renderers, in words
+    field: Field  # the input of the renderers
+    rays: Rays  # the ray, [1, 3]
     truth: TrueRay
-    window: tuple[float, float]
-    lanes: list[LanePanel]
+    window: tuple[float, float]  # the distances at the ends of the field's panel and of the lanes
+    lanes: list[LanePanel]  # one per renderer
 
     @property
     def texts(self) -> list[str]:
-        """All sentences: on the scene, on all renderers, and on each renderer."""
         return [self.scene, self.result, *(f"{panel.lane.title}: {panel.sentences}" for panel in self.lanes)]
 
     @styled
@@ -103,7 +92,10 @@ class RayPicture:
         self._profile(profile)
         if self.window != (self.truth.entry, self.truth.leave):
             magnify(slice_axes, profile, self.window)
-        for shown, lines, inches, shade in zip(self.lanes, texts, under_lane, self._shades(), strict=True):
+        colours = list[str]()
+        for shown, lines, inches in zip(self.lanes, texts, under_lane, strict=True):
+            colours.append(look(shown.lane.name).colour)
+            shade = mixed(colours[-1], colours[:-1].count(colours[-1]))
             axes = panel(LANE_INCHES, 0.3 + inches)
             axes.set_xlim(*self.window)
             draw_lane(axes, shown.lane, shade)
@@ -116,12 +108,6 @@ class RayPicture:
         figure.text(PANEL_LEFT_FRACTION, 1 - under_heading / height, "\n".join(result), fontweight="bold", va="top")
         figure.text(PANEL_LEFT_FRACTION, 0.06 / height, KEY, fontsize=7, color=FAINT)
         return figure
-
-    def _shades(self) -> list[str]:
-        """The colour of each lane: that of its renderer, darker or lighter if an earlier lane has it."""
-        colours = [look(panel.lane.name).colour for panel in self.lanes]
-        repeats = [colours[:index].count(colour) for index, colour in enumerate(colours)]
-        return [mixed(colour, repeat) for colour, repeat in zip(colours, repeats, strict=True)]
 
     def _slice(self, axes: Axes) -> None:
         """The field on a plane through the ray, up in the world to the top; lengths are equal in both directions."""
@@ -184,7 +170,6 @@ def thickened(values: np.ndarray) -> np.ndarray:
 
 
 def magnify(above: Axes, below: Axes, window: tuple[float, float]) -> None:
-    """Marks on the slice which part of the ray is magnified below it."""
     above.axvspan(*window, color=MAGNIFIED, alpha=0.3, lw=0, zorder=0.5)
     for side, x in enumerate(window):
         ends = ((x, 0), (side, 1), above.get_xaxis_transform(), "axes fraction")

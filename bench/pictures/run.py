@@ -19,22 +19,14 @@ class DrawsItself(Protocol):
     """A problem that draws its own pictures, and has the reference of the filmstrip's frames."""
 
     @property
-    def shown(self) -> Shown:
-        """The reference of the frames."""
-        ...
+    def shown(self) -> Shown: ...
 
     def draw(self, folder: Path, states: tuple[State, State], curve: list[dict[str, Any]], title: str) -> None:
-        """Writes the pictures of the run into its folder.
-
-        Args:
-            states: before and after the optimisation.
-        """
+        """Writes the pictures of the run, from the states before and after it, into its folder."""
         ...
 
 
 class RunPictures(Filmstrip):
-    """The pictures of one run."""
-
     def draw(self, run: RunContext, solution: Solution, *, gallery: bool) -> None:
         """Writes the pictures of a solved problem: its filmstrip, summary.png and curve.png, and images.npz."""
         problem, states, curve = solution.problem, solution.states, solution.curve
@@ -64,12 +56,7 @@ class RunPictures(Filmstrip):
 def draw(
     run: RunContext, draw_pictures: Callable[[str], None], filmstrip: Filmstrip, truth: Shown | None = None
 ) -> None:
-    """Writes pictures and filmstrip of a run, after its result is in the record.
-
-    Args:
-        draw_pictures: writes the pictures with a title; not called if pictures are off.
-        truth: see `Filmstrip.save`.
-    """
+    """Writes filmstrip and pictures, by a function of their title, of a run whose result is in the record."""
     title, compared = run.record.outcome, run.record.compared()
     if run.inputs.evaluation.picture is not None:
         errors = [f"{label}: {values_in_words(values)}" for label, values, _ in compared[:1]]

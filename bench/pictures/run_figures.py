@@ -34,41 +34,26 @@ INPUT_AXES_INCHES = 2.0
 
 @dataclass(frozen=True)
 class ViewPair:
-    """Views of one shape.
-
-    Args:
-        front: by the scene's camera, in the size of pictures.
-        back: by a camera behind; None if only the front of the shape is known. The front then has no normals.
-        mask: the silhouette for the scene's camera, in the size in which metrics compare silhouettes.
-    """
+    """Views of one shape."""
 
     title: str
-    front: View
-    back: View | None
-    mask: Bool[Tensor, "height width"]
+    front: View  # by the scene's camera, in the size of pictures
+    back: View | None  # from behind; None if only the front is known, which then has no normals
+    mask: Bool[Tensor, "height width"]  # for the scene's camera, in the size in which metrics compare silhouettes
 
 
 @dataclass(frozen=True)
 class InputView:
-    """The input of a run: depths of a view, or photographs.
-
-    Args:
-        view: of the scene.
-        observed: pixels of the view with a given depth.
-        photographs: all photographs, or None.
-        mask: whether the silhouette was given too.
-        coloured: whether colours were given too.
-    """
+    """The input of a run: depths of a view, or photographs."""
 
     view: View
-    observed: Bool[np.ndarray, "height width"]
+    observed: Bool[np.ndarray, "height width"]  # pixels with a given depth
     photographs: Float[np.ndarray, "views height width 3"] | None = None
-    mask: bool = True
-    coloured: bool = False
+    mask: bool = True  # whether the silhouette was given too
+    coloured: bool = False  # whether colours were given too
 
     @property
     def summary(self) -> str:
-        """The input in a few words."""
         if self.photographs is not None:
             return f"{len(self.photographs)} photographs"
         names = {"mask": self.mask, "colours": self.coloured, f"{int(self.observed.sum())} depths": self.observed.any()}
@@ -148,13 +133,9 @@ def save_images(folder: Path, view: View, true: View) -> None:
 def save_gallery(
     folder: Path, inputs: RunInputs, observed: Bool[Tensor, "height width"], meshes: dict[str, Mesh | None]
 ) -> None:
-    """Writes `folder/images.npz` for galleries: given depths, and meshes from the scene's camera and from behind.
+    """Writes `images.npz` for galleries: observed depths, else NaN, and meshes from the scene's camera and from behind.
 
-    `given` is NaN without a depth. Meshes and the truth, "true", have NAME_normals [2, h, w, 3], NAME_hit [2, h, w].
-
-    Args:
-        observed: pixels of the scene's view whose depth is given.
-        meshes: by name; None shows nothing.
+    Meshes by name and the truth, "true", have NAME_normals [2, h, w, 3], NAME_hit [2, h, w]; None shows nothing.
     """
     cameras = _cameras(inputs, inputs.evaluation.gallery)
     arrays = {"given": torch.where(observed.cpu(), inputs.scene.observed_view()[0].depth, torch.nan)}
@@ -173,10 +154,7 @@ def save_arrays(folder: Path, arrays: dict[str, Tensor]) -> None:
 
 
 def true_view(scene: Scene, camera: Camera) -> View:
-    """The true shape in a camera's size; for a partial truth the given pixels, without normals.
-
-    Depths are NaN at pixels of the silhouette without a measured depth.
-    """
+    """The true shape in a camera's size; for a partial truth the measured pixels, without normals, others NaN."""
     if not scene.is_partial:
         return see(scene.raycaster, camera)
     view, measured = scene.observed_view()

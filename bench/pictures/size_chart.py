@@ -33,7 +33,7 @@ class CandidateResult:
 
     @property
     def error(self) -> float | None:
-        """The error on held-out rays, in scene units."""
+        """Of held-out rays, in scene units."""
         return self.numbers.get("error")
 
     @property
@@ -47,39 +47,25 @@ class CandidateResult:
 
     @property
     def kind(self) -> str:
-        """Its key in `KINDS`."""
         return next(kind for kind in KINDS if self.name.startswith(kind))
 
     @property
     def label(self) -> str:
-        """Its name for readers."""
         return self.name.replace("_", " ")
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """The results of all candidates of a run, in the order of their fits.
-
-    Args:
-        results: of all of them.
-        chosen: the recommended candidate, or None.
-        best: the candidate with the smallest error, or None.
-        measure: the measure of size for the choice.
-        footprint: half a pixel, in scene units; None if unknown.
-    """
+    """The results of all candidates of a run, in the order of their fits."""
 
     results: list[CandidateResult]
-    chosen: CandidateResult | None
-    best: CandidateResult | None
-    measure: str
-    footprint: float | None
+    chosen: CandidateResult | None  # the recommended candidate
+    best: CandidateResult | None  # the candidate with the smallest error
+    measure: str  # of size, for the choice
+    footprint: float | None  # half a pixel, in scene units
 
     def smallest(self, measure: str, *, by_pixel: bool) -> CandidateResult | None:
-        """The candidate with the least `measure` of those that suffice and that further views confirm; None if none.
-
-        Args:
-            by_pixel: whether an error under half a pixel suffices; else one standard error above the least one.
-        """
+        """The confirmed candidate with the least `measure` that suffices, by half a pixel or by the best error."""
         if self.best is None or self.footprint is None:
             return None
         limit = self.footprint if by_pixel else self.best.numbers["error"] + self.best.numbers["standard_error"]
@@ -94,7 +80,6 @@ class Candidates:
 
     @staticmethod
     def of(metrics: dict[str, Any]) -> "Candidates":
-        """The candidates of a record's metrics."""
         fit_names = [name.removesuffix(".stored") for name in metrics if name.endswith(".stored")]
         names = [name for name in fit_names if name not in ("auto", "frugal")]  # further fits of candidates
         results = {
@@ -118,7 +103,6 @@ def marker_points(stored: int) -> float:
 
 @rc_context(style.SCREEN)
 def draw_candidates(folder: Path, metrics: dict[str, Any], title: str) -> None:
-    """Writes ladder.png into a run folder."""
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     _panels(figure.subplots(1, 2, sharey=True), Candidates.of(metrics))
     figure.suptitle(title)
@@ -126,7 +110,6 @@ def draw_candidates(folder: Path, metrics: dict[str, Any], title: str) -> None:
 
 
 def _panels(axes: np.ndarray, candidates: Candidates) -> None:
-    """Draws errors over size and FLOPs, with standard errors, half a pixel and the recommendation."""
     fitted = [result for result in candidates.results if result.error is not None]
     for axis, key in zip(axes, (candidates.measure, FLOPS), strict=True):
         for kind, (label, colour, marker) in KINDS.items():

@@ -27,10 +27,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def log_axis(axes: Axes, letter: str, values: Any) -> None:
-    """Makes the axis "x" or "y" logarithmic, with plain numbers as ticks; only positive values are drawn.
-
-    Without positive values, or if they lie within a factor of 2, the axis stays linear.
-    """
+    """Makes the axis "x" or "y" logarithmic, with plain ticks, unless its positive values are within a factor of 2."""
     positive = [x for x in finite(values) if x > 0]
     if not positive or 1 < max(positive) / min(positive) < 2:
         return
@@ -63,15 +60,9 @@ def bare(axis: Any) -> Any:
 
 
 def window(masks: Sequence[np.ndarray], margin: float = 0.08) -> tuple[float, float, float]:
-    """The square part of pictures that contains all masks, with a margin.
+    """The upper edge, left edge and side of the square part of pictures that contains all masks, with a margin.
 
-    Args:
-        masks: [height, width], with the same aspect ratio; their sizes may differ.
-        margin: as a fraction of the masks' extent.
-
-    Returns:
-        Its upper edge, left edge and side, in units of a picture's larger side. If all masks are empty, the side is the
-        smaller side.
+    In units of a picture's larger side. The side is the smaller side if all masks are empty.
     """
     sizes = [max(mask.shape) for mask in masks]
     max_side = min((min(mask.shape) / size for mask, size in zip(masks, sizes, strict=True)), default=1.0)

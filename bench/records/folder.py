@@ -210,7 +210,6 @@ def _without_requests(content: bytes) -> bytes:
 
 
 def free_reserve(folder: Path) -> None:
-    """Frees the reserved bytes before the last write."""
     (folder / RESERVE_FILE).unlink(missing_ok=True)
 
 

@@ -117,7 +117,6 @@ def _as_typed(value: Any) -> str:
 
 
 def _group_numbers(values: list[Any]) -> list[int]:
-    """A number for each value, the same for equal values."""
     numbers: dict[Any, int] = {}
     return [numbers.setdefault(value, len(numbers)) for value in values]
 

@@ -10,13 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.records.names import SharedSettings
-from bench.records.record import (
-    NOT_RUN,
-    SCHEMA,
-    Record,
-    is_outside,
-    started,
-)
+from bench.records.record import NOT_RUN, SCHEMA, Record, is_outside, started
 from bench.records.results import PLAN_FILE, Plan, PlannedRun, check_links, read_run, run_folders
 
 

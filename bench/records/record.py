@@ -63,7 +63,6 @@ NOT_RUN = "not_run"  # the status of a planned cell without a run, which has no 
 
 
 def now() -> str:
-    """The current time in UTC, to the millisecond."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
@@ -115,7 +114,6 @@ class Record:
 
     @property
     def name(self) -> str:
-        """The run's name in tables; see `row_name`."""
         return row_name(self.config, self.renderer)
 
     @property
@@ -125,7 +123,6 @@ class Record:
 
     @property
     def outcome(self) -> str:
-        """The title with the status."""
         return f"{self.title}: {self.status}"
 
     def compared(self) -> list[tuple[str, dict[str, str], str]]:
@@ -141,7 +138,6 @@ class Record:
 
     @property
     def folder(self) -> Path:
-        """The run's folder, in the results folder of its configuration."""
         return Path(self.config["results_dir"]) / "runs" / self.id
 
     @classmethod
@@ -151,7 +147,6 @@ class Record:
         return cls(**{**values, "status": RunStatus(data["status"])})
 
     def write(self, folder: Path) -> None:
-        """Writes `record.json` atomically."""
         write_text(folder / "record.json", to_json({"schema": SCHEMA, **self.__dict__}))
 
 

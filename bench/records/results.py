@@ -9,16 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from bench.records.record import (
-    SCHEMA,
-    bad_link,
-    from_json_values,
-    is_outside,
-    now,
-    read_record,
-    to_json,
-    write_text,
-)
+from bench.records.record import SCHEMA, bad_link, from_json_values, is_outside, now, read_record, to_json, write_text
 
 RESULTS = "results/local"  # the default results folder; conf/config.yaml has the same
 PLAN_FILE = "plan.json"
@@ -51,7 +42,6 @@ class PlannedRun:
 
     @property
     def folder(self) -> Path:
-        """The folder of the run."""
         return Path(self.config["results_dir"]) / "runs" / self.id
 
 
@@ -71,15 +61,12 @@ class Plan:
 
     @cached_property
     def common(self) -> set[str]:
-        """The overrides that all cells share."""
         return set.intersection(*(set(cell.overrides) for cell in self.cells))
 
     def distinct_overrides(self, cell: PlannedRun) -> list[str]:
-        """The overrides of a cell that not all cells share."""
         return [override for override in cell.overrides if override not in self.common]
 
     def write(self) -> None:
-        """Writes `plan.json`."""
         check_links(self.results_dir)
         self.folder.mkdir(parents=True, exist_ok=True)
         head = to_json({"schema": SCHEMA, "name": self.name, "asked": self.asked, "cells": []}).rstrip(" \n]}")

@@ -20,10 +20,7 @@ KEYS = {text.partition("=")[0]: text for text in KEY_FORMS}
 
 
 def main(arguments: list[str]) -> int:
-    """Writes all pages, the tables of sweeps and `index.html`.
-
-    Returns the exit status: 2 if an argument is wrong, 1 if a page could not be made or a run not read, else 0.
-    """
+    """Writes all pages and `index.html`; returns 2 for a wrong argument, 1 if a page or a run is missing, else 0."""
     if arguments in (["-h"], ["--help"]):
         print(USAGE)
         return 0
@@ -58,7 +55,6 @@ def _report(options: dict[str, str]) -> int:
 
 
 def _write_all(results_dir: Path, meshes: int | None) -> int:
-    """Writes all pages of a results folder; returns the exit status."""
     records, unread = read_records(results_dir)
     failed_pages: list[str] = []
     page_paths = write_paper(records, results_dir, problems=failed_pages)
@@ -71,11 +67,7 @@ def _write_all(results_dir: Path, meshes: int | None) -> int:
 
 
 def parse_options(arguments: list[str]) -> dict[str, str]:
-    """Splits the arguments into keys and values.
-
-    Raises:
-        ValueError: a key is unknown, or its value is missing.
-    """
+    """Splits the arguments into keys and values; raises ValueError if a key is unknown, or its value is missing."""
     options = {}
     for argument in arguments:
         key, _, value = argument.partition("=")

@@ -44,10 +44,7 @@ NUMBERS = (
 
 
 def cells_of(runs: Runs) -> pd.DataFrame:
-    """A line per run: axis, row, whether its search finished, and its breakdown as number, shade and text.
-
-    A level is 0 at the mild end of the sweep and 1 at the severe end; the shade is the level clipped to 0 and 1.
-    """
+    """A line per run: axis, row, whether its search finished, and its breakdown as number, shade and text."""
     cells = runs.frame[["row", "preset"]].assign(
         axis=runs.frame["dataset"].astype(object),
         **{key: [record[key] for record in runs.records] for key in ("status", "reason", "folder")},
@@ -71,7 +68,6 @@ def cells_of(runs: Runs) -> pd.DataFrame:
 
 
 def criteria(runs: Runs) -> dict[str, float]:
-    """The criteria of success of the runs, for `SUCCESS`."""
     names, task = ("hits", "false_hits", "cosine", "scale", "surface_error"), runs.requested().get("task")
     return {name: float(records.setting(task, "criteria", name) or math.nan) for name in names}
 
@@ -85,12 +81,10 @@ def axes_of(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def title(axis: str) -> str:
-    """The severe case of an axis in words."""
     return SEVERE_WORDS.get(axis, axis.replace("_", " "))
 
 
 def group_title(group: str) -> str:
-    """The name of a group of axes for readers."""
     return GROUP_TITLES.get(group, group)
 
 
@@ -149,7 +143,6 @@ def _breakdown_texts(cell: Any, unit: str) -> tuple[str, str]:
 
 
 def failed_trials(cell: Any, end: str) -> str:
-    """The number of failed trials at an end of the sweep."""
     successes, trials = (getattr(cell, f"{end}_{name}") for name in ("successes", "trials"))
     return f"{trials - successes:.0f} of {trials:.0f} trials failed"
 

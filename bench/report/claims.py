@@ -45,43 +45,27 @@ CHECKED, UNTESTED, AS_CLAIMED = "checked by a test", "not tested", "as claimed"
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of a paper.
+    """A claim of a paper."""
 
-    Args:
-        source: the paper, and its table, figure or section.
-        text: the claim.
-        published: returns the paper's ratio; None where it gives no number.
-        experiment: name of the experiment whose runs measure it; empty if it is not measured.
-        command: name of the experiment that makes the runs, if it is another one.
-        top, bottom: presets of the rows whose ratio is computed; without `bottom`, the metric of `top` itself.
-        metric: an error, a cost or `DISORDER`; less is better.
-        expected: the least and the largest ratio that the claim allows.
-        top_settings, bottom_settings: settings of the runs of `top` and of `bottom`; None: the same.
-        families: families of shapes; empty for all.
-        test: name of a test of this project that fails if the claim does not hold; else empty.
-        why: the cause if the claim does not hold here, or what a measurement needs.
-    """
-
-    source: str
+    source: str  # the paper, and its table, figure or section
     text: str
-    published: Callable[[], float] | None = None
-    experiment: str = ""
-    top: str = ""
-    bottom: str = ""
-    metric: str = "chamfer_l2"
-    expected: tuple[float, float] = SMALLER
-    top_settings: RunSettings = field(default_factory=dict)
-    bottom_settings: RunSettings | None = None
-    families: tuple[str, ...] = ()
-    command: str = ""
-    test: str = ""
-    why: str = ""
+    published: Callable[[], float] | None = None  # the paper's ratio; None if it gives no number
+    experiment: str = ""  # whose runs measure it; empty if it is not measured
+    top: str = ""  # the preset of the upper row
+    bottom: str = ""  # the preset of the lower row; empty: the metric of `top` itself
+    metric: str = "chamfer_l2"  # an error, a cost or `DISORDER`; less is better
+    expected: tuple[float, float] = SMALLER  # the least and the largest ratio that the claim allows
+    top_settings: RunSettings = field(default_factory=dict)  # of the runs of `top`
+    bottom_settings: RunSettings | None = None  # of the runs of `bottom`; None: the same
+    families: tuple[str, ...] = ()  # of shapes; empty for all
+    command: str = ""  # the experiment that makes the runs, if it is another one
+    test: str = ""  # a test of this project that fails if the claim does not hold
+    why: str = ""  # the cause if the claim does not hold here, or what a measurement needs
 
 
 def page(
     claims: Sequence[Claim], runs: Mapping[str, Runs | None], title: str, question: str, notes: Sequence[str]
 ) -> Result:
-    """A page with a line for each claim, from the runs of each experiment."""
     lines = [_line(claim, runs.get(claim.experiment)) for claim in claims]
     return Result(
         merge_runs(*runs.values()),
@@ -129,7 +113,13 @@ def pairs_of(claim: Claim, runs: Runs) -> pd.DataFrame | None:
     """The errors of a claim's two rows on each common shape; None without a common shape."""
     runs = runs.executed
     try:
-        error = _disorder(runs) if claim.metric == DISORDER else runs.error(claim.metric, 1)
+        if claim.metric == DISORDER:  # of a run; nan if it has too few iterations
+            folders = [runs.folder(record) for record in runs.records]
+            histories = [curves.read(folder)[0].dropna(subset=["total", "chamfer_l2"]) for folder in folders]
+            rhos = [curves.spearman(history, "total", "chamfer_l2") for history in histories]
+            error = 1 - pd.Series(rhos, runs.frame.index, dtype=float)
+        else:
+            error = runs.error(claim.metric, 1)
     except NoFolder:
         return None
     frame = runs.frame[[*SHAPE, "preset"]].assign(error=error)
@@ -149,13 +139,6 @@ def pairs_of(claim: Claim, runs: Runs) -> pd.DataFrame | None:
     return None if pairs.empty else pairs
 
 
-def _disorder(runs: Runs) -> pd.Series:
-    """1 - ρ of loss and error over the iterations of each run; nan if a run has too few."""
-    histories = [curves.read(runs.folder(record))[0].dropna(subset=["total", "chamfer_l2"]) for record in runs.records]
-    rhos = [curves.spearman(history, "total", "chamfer_l2") for history in histories]
-    return 1 - pd.Series(rhos, runs.frame.index, dtype=float)
-
-
 def _as_number(text: str) -> float | str:
     """A setting as a number, so that 20 and 20.0 are equal; unchanged if it is no number."""
     try:
@@ -165,7 +148,6 @@ def _as_number(text: str) -> float | str:
 
 
 def verdict_of(claim: Claim, ratio: statistics.Interval) -> str:
-    """The verdict of a measured ratio on a claim, by the rules in `RULES`."""
     least, most = claim.expected
     if not ratio.has_ends:
         as_claimed = least <= ratio.value <= most

@@ -75,7 +75,6 @@ def ratio_of(gap: Gap | None) -> Interval | None:
 
 
 def pooled(lines: Sequence[Line]) -> list[Line]:
-    """The lines over all families, which come first."""
     return [line for line in lines if line["family"] == lines[0]["family"]]
 
 
@@ -89,26 +88,19 @@ def ratio_columns(heading: str) -> list[Column]:
 
 @dataclass(frozen=True)
 class Compared:
-    """The runs of a comparison.
-
-    Args:
-        runs: at least one.
-        reference: the preset of the reference row. If several rows have it, the one that the sweep planned first.
-        metric: the error.
-        label: the name of the error on axes.
-    """
+    """The runs of a comparison, at least one."""
 
     runs: Runs
-    reference: str
-    metric: str = METRIC
-    label: str = LABEL
+    reference: str  # the preset of the reference row; of several rows with it, the first that the sweep planned
+    metric: str = METRIC  # the error
+    label: str = LABEL  # of the error on axes
 
     @cached_property
     def cells(self) -> pd.DataFrame:
         """A line per run: family, row, preset, solid, view, seed, condition, ok, costs, error and score.
 
-        The score of a run is its error if it is finite, else the largest finite error of any row on the same shape,
-        view, seed and condition. It is infinite if every row failed.
+        The score is the error if it is finite, else the largest finite error on the same shape, view, seed and
+        condition; infinite if every row failed.
         """
         frame = self.runs.frame
         cells = frame[["family", "row", "preset", "solid", "view", "seed"]].assign(
@@ -132,10 +124,7 @@ class Compared:
 
     @cached_property
     def planned(self) -> list[Row]:
-        """The rows in the order of the sweep that planned most runs, then the others in the order of the runs.
-
-        It reads all plans, so it is used only to choose one of several rows.
-        """
+        """The rows in the order of the sweep that planned most runs, then the others. It reads all plans."""
         row_by_id = {record["folder"]: row_of(record) for record in self.runs.records}
         plans, _ = read_plans(self.runs.results_dir)
         planned_rows = [[row_by_id[cell.id] for cell in plan.cells if cell.id in row_by_id] for plan in plans]
@@ -144,7 +133,6 @@ class Compared:
 
     @cached_property
     def reference_row(self) -> Row | None:
-        """The reference row, if it was run."""
         candidates = [row for row in self.rows if row.preset == self.reference]
         return min(candidates, key=self.planned.index) if len(candidates) > 1 else next(iter(candidates), None)
 
@@ -159,7 +147,6 @@ class Compared:
         return lines if condition is None else lines[lines["condition"] == condition]
 
     def median(self, family: str, row: Row, condition: str) -> float | None:
-        """The median error over shapes and seeds; None if nothing was planned."""
         errors = self.cells_of(family, row, condition).error
         return float(statistics.median(errors.to_numpy())) if len(errors) else None
 
@@ -201,9 +188,8 @@ class Compared:
     def lines(self) -> list[Line]:
         """A line per family and row; with several families, lines over all families come first.
 
-        Its keys: family, row, preset, the median at each condition, the mean `error`, `ratio` (a `Gap`, or None for the
-        reference), median costs, `failed`, and `lacking`, the number of missing shapes and seeds. A row that lacks some
-        is in no verdict.
+        `ratio` is a `Gap`, or None for the reference; `lacking` is the number of missing shapes and seeds. A row that
+        lacks some is in no verdict.
         """
         names = [ALL_FAMILIES, *self.families] if len(self.families) > 1 else self.families
         return [self._line(name, row) for name in names for row in self.rows]
@@ -227,10 +213,7 @@ class Compared:
 
     @cached_property
     def oracles(self) -> dict[str, float]:
-        """The median Chamfer x 1000 of the prior's fits, for each family with fits of all shapes.
-
-        The fits must have been evaluated like the runs: with the same split, prior, grid and number of points.
-        """
+        """The median Chamfer x 1000 of the prior's fits, evaluated like the runs; of families with all shapes."""
         runs, fits = self.runs, self.runs.other(PRIORS)
         if fits is None or _evaluation_settings(fits.requested()) != _evaluation_settings(runs.requested()):
             return {}
@@ -240,12 +223,7 @@ class Compared:
         return {name: float(statistics.median([errors[key] for key in shapes])) for name, shapes in fitted.items()}
 
     def extended_lines(self, above: Above, published: dict[str, dict[str, Any]]) -> list[Line]:
-        """The lines of each family, with further lines above and published lines below.
-
-        Args:
-            above: the medians of the further lines, by name and family.
-            published: the published numbers, by family, row and condition; or by family and row.
-        """
+        """The lines of each family, with medians of further lines above, and published numbers below."""
         lines = []
         for family in dict.fromkeys(line["family"] for line in self.lines):
             empty = {"family": family, "error": "", "ratio": None, "failed": ""}
@@ -262,7 +240,6 @@ class Compared:
         return lines
 
     def columns(self, ratio: str) -> list[Column]:
-        """The columns of the lines; `ratio` is the heading of the ratio."""
         return [
             *columns(word, family="Family", row="Method"),
             *columns(**{condition: heading(condition) for condition in self.conditions}),
@@ -275,10 +252,7 @@ class Compared:
 
     @property
     def comparable(self) -> list[Line]:
-        """The pooled lines of rows that lack no shape and have the settings of most runs; verdicts use only these.
-
-        The settings are those of `Runs.mixed`. A note warns that rows with other values of these do not compare.
-        """
+        """The pooled lines of rows that lack no shape and have the settings, of `Runs.mixed`, of most runs."""
         is_usual = np.ones(len(self.runs.records), dtype=bool)
         for key in self.runs.mixed():
             values = self.runs.setting(key)
@@ -334,32 +308,22 @@ class Compared:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A page with a line per family and row, the ratio to a reference row, and a figure with a line per row.
-
-    Args:
-        title, question, notes, plotted, run_columns, figure: as in `Result`; by default, `Compared.panels` are drawn.
-        reference, metric, label: as in `Compared`.
-        name: the name of the reference in headings and verdicts.
-        least_of: errors whose smallest is the verdict; if empty, the verdict is on the ratios.
-        above: returns further lines, as in `Compared.extended_lines`.
-        published: a table of `conf/published.yaml`.
-        hidden: keys of columns that are left out.
-    """
+    """A page with a line per family and row, the ratio to a reference row, and a figure; see `Result`, `Compared`."""
 
     title: str
     question: str
     reference: str
-    name: str
+    name: str  # of the reference, in headings and verdicts
     notes: Callable[[Compared], Iterable[str]]
     plotted: str = PLOTTED
-    least_of: str = ""
+    least_of: str = ""  # errors whose smallest is the verdict; empty: the verdict is on the ratios
     metric: str = METRIC
     label: str = LABEL
-    above: Callable[[Compared], Above] = lambda _: {}
-    published: str = ""
-    hidden: Collection[str] = ()
+    above: Callable[[Compared], Above] = lambda _: {}  # further lines, as in `Compared.extended_lines`
+    published: str = ""  # a table of `conf/published.yaml`
+    hidden: Collection[str] = ()  # keys of columns that are left out
     run_columns: Sequence[Column] = ()
-    figure: Callable[[Compared], Figure] | None = None
+    figure: Callable[[Compared], Figure] | None = None  # None: `Compared.panels`
 
     def __call__(self, runs: Runs) -> Result:
         compared, ratio = Compared(runs, self.reference, self.metric, self.label), f"Ratio to {self.name}"
@@ -417,7 +381,6 @@ def ordered(conditions: Collection[str]) -> list[str]:
 
 
 def heading(condition: str) -> str:
-    """The heading of a condition's column; a number is a number of depth points."""
     return f"{condition} pts" if condition.isdigit() else condition or "Median"
 
 

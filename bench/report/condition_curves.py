@@ -35,38 +35,22 @@ class Measure:
 
 @dataclass(frozen=True)
 class ConditionCurves:
-    """A page over the values of a condition.
+    """A page over the values of a condition. A run that ended without progress counts with its result."""
 
-    Args:
-        condition: key of the configuration.
-        heading: of the condition.
-        first: the value that the verdict and the ratios compare with.
-        compared: the value of the verdict.
-        measures: the metrics. Ratios and the verdict are of the first, whose `failed` is a number. A run that ended
-            without progress counts with its result.
-        title, question, verdict: text; `verdict` begins the sentence with the ratios.
-        notes: of the runs.
-        absent: the value of the condition in runs without the key.
-        reference: preset of the row with which the verdict compares the others at `compared`; empty: each row is
-            compared with itself at `first`.
-        only_in_table: presets that the figure leaves out, and the verdict too without a `reference`.
-    """
-
-    condition: str
-    heading: str
-    first: float
-    compared: float
-    measures: tuple[Measure, ...]
+    condition: str  # key of the configuration
+    heading: str  # of the condition
+    first: float  # the value that the verdict and the ratios compare with
+    compared: float  # the value of the verdict
+    measures: tuple[Measure, ...]  # ratios and the verdict are of the first, whose `failed` is a number
     title: str
     question: str
-    verdict: str
+    verdict: str  # begins the sentence with the ratios
     notes: Callable[[Runs], list[str]]
-    absent: float = 0.0
-    reference: str = ""
-    only_in_table: tuple[str, ...] = ()
+    absent: float = 0.0  # the value of the condition in runs without the key
+    reference: str = ""  # preset of the row that the verdict compares with at `compared`; empty: each row at `first`
+    only_in_table: tuple[str, ...] = ()  # presets that the figure leaves out, and the verdict without a `reference`
 
     def __call__(self, runs: Runs) -> Result:
-        """A line per row and value of the condition, over all shapes."""
         runs = runs.executed
         values = runs.number(f"config.{self.condition}").fillna(self.absent)
         metrics = {each.key: each.factor * runs.number(each.key).fillna(each.failed) for each in self.measures}
@@ -106,11 +90,13 @@ class ConditionCurves:
             groups = {value: group.set_index(SHAPE).sort_index() for value, group in row.groupby("value")}
             for value, group in groups.items():
                 measured = {each.key: group[each.key].dropna() for each in self.measures}
-                estimates = {key: _median(of_runs) for key, of_runs in measured.items() if len(of_runs)}
+                groups_of = {key: statistics.shape_groups(of_runs) for key, of_runs in measured.items() if len(of_runs)}
+                estimates = {key: statistics.typical(of_shapes) for key, of_shapes in groups_of.items()}
                 gain = None if value == self.first else self._gain(group, groups.get(self.first))
                 lines.append(
                     {
-                        **{"name": name, "preset": preset, "value": _whole(value), "shapes": len(group)},
+                        **{"name": name, "preset": preset, "shapes": len(group)},
+                        "value": int(value) if value == int(value) else value,
                         **{key: estimate.value for key, estimate in estimates.items()},
                         **{"estimates": estimates, "ratio": gain and gain.value, "gain": gain},
                         "cost": format.number(group.cost.median()),
@@ -120,7 +106,7 @@ class ConditionCurves:
         return lines
 
     def _gain(self, group: pd.DataFrame, first: pd.DataFrame | None) -> statistics.Interval | None:
-        """The ratio of the first measure to that at the first value, on the common shapes; None without any."""
+        """The ratio of the first measure, on common shapes."""
         key = self.measures[0].key
         return None if first is None else statistics.common_ratio(group[key], first[key])
 
@@ -140,7 +126,6 @@ class ConditionCurves:
         return {name: gain for name, gain in gains.items() if gain is not None}
 
     def _verdict(self, ratios: dict[str, statistics.Interval]) -> str:
-        """The significant ratios, and the number of others."""
         if not ratios:
             return f"No ratio at {self.heading.lower()} {self.compared:g}: no row has it with a row to compare it with."
         verdicts = dict(zip(ratios, statistics.ratio_verdicts([*ratios.values()]), strict=True))
@@ -172,11 +157,3 @@ class ConditionCurves:
         ]
         ticks = [f"{value:g}" for value in values]
         return chart.panel_data("", self.heading.lower(), measure.heading, curves, ticks=ticks)
-
-
-def _whole(value: float) -> float | int:
-    return int(value) if value == int(value) else value
-
-
-def _median(values: pd.Series) -> statistics.Interval:
-    return statistics.typical(statistics.shape_groups(values))

@@ -19,24 +19,17 @@ NAME_COLUMNS = (text("family", "Family"), text("method", "Method"), text("condit
 
 @dataclass(frozen=True)
 class Condition:
-    """A setting of the task that varies.
-
-    Args:
-        key: its name in the task.
-        label: its name on axes, with the unit.
-        neutral: its value in runs that vary another condition.
-    """
+    """A setting of the task that varies."""
 
     key: str
-    label: str
-    neutral: float
+    label: str  # on axes, with the unit
+    neutral: float  # in runs that vary another condition
 
     def value_of(self, record: Record) -> float:
         return float(setting(record["config"], "task", self.key))
 
 
 def run_columns(conditions: Sequence[Condition], *other_keys: str) -> tuple[Column, ...]:
-    """The columns of the CSV: identity, conditions, other settings of the task, and metrics."""
     keys = (*(configured(condition.key, "task", condition.key) for condition in conditions), *IDENTITY)
     return (FAMILY, *keys, *(configured(key, "task", key) for key in other_keys), *metrics(ONE_WAY, "chamfer_l2"))
 
@@ -54,10 +47,7 @@ def median_error(runs: Sequence[Record]) -> Interval:
 
 
 def lines_of(runs: Sequence[Record], conditions: Sequence[Condition]) -> list[dict[str, Any]]:
-    """A line per family, row, condition and value, from the runs whose other conditions are neutral.
-
-    Its keys: family, method, preset, condition (as text), key, value, runs, error.
-    """
+    """A line per family, row, condition and value, from the runs whose other conditions are neutral."""
     lines = []
     for condition in conditions:
         others = [other for other in conditions if other != condition]

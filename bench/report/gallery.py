@@ -84,7 +84,6 @@ class Scene:
         self.windows = [style.window([hit[view] for hit in views]) for view in range(min(map(len, views), default=1))]
 
     def cell(self, record: Record | None, paint: Paint, views: Sequence[int] = (FRONT,)) -> Cell:
-        """The pictures of a run in some views, with its status if it did not end ok."""
         if record is None:
             return Cell(note="no run")
         arrays, note = self.arrays.get(record["folder"]), record["status"] if record["status"] != "ok" else ""
@@ -105,7 +104,6 @@ class Scene:
 
 
 def on_white(colours: np.ndarray, hit: np.ndarray) -> np.ndarray:
-    """Colours [..., 3] of the hits on a white background."""
     return np.where(hit[..., None], np.nan_to_num(colours), 1.0).clip(0, 1)
 
 
@@ -125,7 +123,6 @@ def colours(prefix: str = "") -> Paint:
 
 
 def depth(arrays: Arrays) -> Sequence[np.ndarray]:
-    """Paints the given depths; near ones are yellow."""
     depths = arrays["given"][np.isfinite(arrays["given"])]
     low, high = (depths.min(), depths.max()) if depths.size else (0.0, 1.0)
     shown = colormaps["viridis_r"].with_extremes(bad=style.PAPER)
@@ -176,8 +173,8 @@ class ComparedPictures:
 def compare_with_reference(runs: Runs, max_columns: int) -> ComparedPictures:
     """Compares the runs of one scene with its reference: normals above, differences below.
 
-    The scale of angles ends at the 99th percentile over all pixels, rounded up. The reference is of the largest
-    picture; the heading of a smaller picture names its size.
+    The scale of angles ends at the 99th percentile, rounded up. The reference is of the largest picture; the heading of
+    a smaller picture names its size.
     """
     records = runs.records
     scene = Scene(runs, records, REFERENCE)
@@ -219,12 +216,7 @@ def first_shapes(runs: Runs, max_shapes: int, presets: Sequence[str] = ()) -> Ru
 
 @figure_style.styled
 def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = None) -> Figure:
-    """Draws blocks one above the other.
-
-    Args:
-        across: the number of pictures side by side in a cell.
-        largest: the largest angle of `difference_pictures` in degrees; with it, a colour bar and a legend are drawn.
-    """
+    """Draws blocks one above the other, with `across` pictures in a cell; `largest` ends the scale of angles."""
     bar = 0.0 if largest is None else COLOUR_BAR_INCHES
     lengths = [min(len(name), ROW_NAME_LETTERS) for block in blocks for name in block.rows]
     names = MAX_ROW_NAME_INCHES * max(lengths, default=0) / ROW_NAME_LETTERS
@@ -249,10 +241,7 @@ def draw(blocks: Sequence[Block], *, across: int = 1, largest: float | None = No
 
 
 def fill(axis: Axes, block: Block, inches: float, across: int = 1) -> None:
-    """Draws a block into axes, with pictures of `inches`.
-
-    One pair of axes has all pictures, as a figure of many axes takes seconds.
-    """
+    """Draws a block, with pictures of `inches`, into one pair of axes, as a figure of many axes takes seconds."""
     style.bare(axis)
     columns, rows = max(len(block.columns), 1), max(len(block.rows), 1)
     axis.set(xlim=(0, columns * across), ylim=(rows, 0), aspect="equal")
@@ -284,7 +273,6 @@ def _show(axis: Axes, picture: np.ndarray, window: Window | None, corner: tuple[
 
 
 def _explain(figure: Figure, axes: Sequence[Axes], largest: float) -> None:
-    """Draws the colour bar and the legend of `difference_pictures`."""
     colours = ScalarMappable(Normalize(0, largest), figure_style.error_colours())
     label = "angle between\nnormals (degrees)"
     figure.colorbar(colours, ax=axes, label=label, shrink=0.9 / len(axes), aspect=25, extend="max", pad=0.01)
@@ -294,5 +282,4 @@ def _explain(figure: Figure, axes: Sequence[Axes], largest: float) -> None:
 
 
 def _wrapped(text: str, letters: int) -> str:
-    """The text with its lines broken at `letters`."""
     return "\n".join(piece for line in text.split("\n") for piece in textwrap.wrap(line, letters) or [""])

@@ -35,10 +35,7 @@ def scored(runs: Runs, name: str) -> pd.Series:
 
 
 def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
-    """A line per row: medians of metrics (failed runs are worst), failures, and median costs of runs that ended ok.
-
-    If a run that ended ok lacks a metric, its median is None.
-    """
+    """A line per row: medians of metrics (failed runs are worst; None if an ok run lacks one), failures, and costs."""
     runs = runs.executed
     frame = runs.frame[["row", "preset"]].assign(
         **{name: scored(runs, name) for name in names},
@@ -57,7 +54,6 @@ def medians(runs: Runs, names: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def errors_of(runs: Iterable[Record], metric: str) -> dict[RunKey, float]:
-    """The error of each run; infinite for a failed run."""
     return {run_key(record): error(record, metric) for record in runs}
 
 
@@ -76,7 +72,7 @@ def cost(runs: Runs) -> dict[str, pd.Series]:
 
 
 def comparable_medians(lines: Sequence[Mapping[str, Any]], name: str) -> dict[str, float | None]:
-    """A median by row, for the rows with the most runs; rows with fewer runs lack shapes."""
+    """A median by row, of the rows with the most runs; others lack shapes."""
     max_runs = max((line["runs"] for line in lines), default=0)
     return {line["method"]: line[name] for line in lines if line["runs"] == max_runs}
 
@@ -84,13 +80,7 @@ def comparable_medians(lines: Sequence[Mapping[str, Any]], name: str) -> dict[st
 def draw_runs(
     runs: Runs, panels: Mapping[str, pd.Series], rows: Sequence[Row] | None = None, *, log: bool = True
 ) -> Figure:
-    """Draws a panel per measure, with a line per row: a point per run, and a bar at the median of several.
-
-    Args:
-        panels: the values of each measure, by axis label; nan is not drawn, infinite is drawn at the edge.
-        rows: all rows from top to bottom; by default in the order of the runs.
-        log: whether an axis may be logarithmic.
-    """
+    """Draws a panel per measure and label, with a line per row: a point per run, and a bar at the median of several."""
     rows, chart_panels = list(rows or runs.rows()), []
     for label, values in panels.items():
         drawn = []

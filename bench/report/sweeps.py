@@ -57,15 +57,14 @@ UNDIRECTED = "Of metrics of which neither direction is better, medians are of th
 class Sweep:
     """The runs of a sweep, one per planned cell, each with the name of its row; and the swept keys with their values.
 
-    `missing` is the number of cells that were not run, or killed. They are in `runs` only if no cell ended. `axis` is
-    the only swept setting that is a number, if there is one. Each run has its value as `position`, and the name of
-    its row without it as `curve`.
+    If only one swept setting is a number, it is the `axis`: each run has its value as `position`, and the name of its
+    row without it as `curve`.
     """
 
     name: str
     swept: dict[str, list[str]]
     runs: Runs
-    missing: int
+    missing: int  # cells that were not run, or killed; they are in `runs` only if no cell ended
     axis: str
     command: str
 
@@ -86,10 +85,7 @@ class Sweep:
 
 
 def write_sweeps(records: list[Record], results_dir: Path, problems: list[str]) -> list[Path]:
-    """Writes `results_dir/sweeps/NAME/table.{csv,json,md,tex}` of each sweep without a study; returns the CSVs.
-
-    `problems` gets a line for each sweep whose table cannot be made.
-    """
+    """Writes `results_dir/sweeps/NAME/table.*` of each sweep without a study; returns the CSVs. See `write_sweep`."""
     by_folder, studied, written = {record["folder"]: record for record in records}, _studied(), list[Path]()
     for plan in read_plans(results_dir)[0]:
         if plan.cells[0].config.get("experiment") not in studied:
@@ -98,10 +94,9 @@ def write_sweeps(records: list[Record], results_dir: Path, problems: list[str]) 
 
 
 def write_sweep(plan: Plan, records: list[Record], problems: list[str]) -> list[Path]:
-    """Writes the tables of a finished sweep: those of the study named as its experiment, or its own.
+    """Writes the tables of a finished sweep: those of the study named as its experiment, or its own; returns the CSVs.
 
-    Returns the paths of the CSVs; empty if no page has the experiment's name. `problems` gets a line for a table that
-    cannot be made.
+    `problems` gets a line for a table that cannot be made.
     """
     if (experiment := plan.cells[0].config.get("experiment")) in _studied():
         return write_paper(records, plan.results_dir, problems=problems, only=experiment)
@@ -113,14 +108,14 @@ def _write_plan(plan: Plan, by_folder: dict[str, Record], problems: list[str]) -
     if not any(cell.id in by_folder for cell in plan.cells):
         return []
     try:
-        return [_write(of_plan(plan, by_folder), plan.folder)[0]]
+        table = table_of(of_plan(plan, by_folder))
+        return [write(table, table.shown(), plan.folder / TABLE, name=plan.name)[0]]
     except RECORD_ERRORS as error:
         problems.append(f"not made: {SWEEPS}/{plan.name} ({type(error).__name__}: {error})")
         return []
 
 
 def summary_lines(tables: Sequence[Path]) -> list[str]:
-    """What a sweep prints about its tables: the answer, the paths, and the pictures."""
     lines = []
     for path in tables:
         shown = read_shown(path.with_suffix(".json"))
@@ -134,7 +129,8 @@ def of_plan(plan: Plan, record_by_id: dict[str, Record]) -> Sweep:
     """The sweep of a plan with its known records. Equivalent cells share one run."""
     cells = {cell.id: cell for cell in plan.cells if cell.id in record_by_id}
     runs = [record_by_id[name] for name in cells]
-    overrides = [_override_values(cell.overrides) for cell in cells.values()]
+    pairs = [[text.partition("=") for text in cell.overrides if "=" in text] for cell in cells.values()]
+    overrides = [{key.lstrip("+"): value for key, _, value in of_cell} for of_cell in pairs]
     keys = dict.fromkeys(key for values in overrides for key in values)
     swept = {key: list(dict.fromkeys(values[key] for values in overrides if key in values)) for key in keys}
     swept = {key: values for key, values in swept.items() if len(values) > 1}
@@ -155,8 +151,8 @@ def of_plan(plan: Plan, record_by_id: dict[str, Record]) -> Sweep:
 def lines(sweep: Sweep) -> list[dict[str, Any]]:
     """A line per row: its counts, its costs, each metric's median with its interval, and the ratio of the first metric.
 
-    The ratio is to the first row, paired by shape, or None. The median of the first metric on each data set that all
-    rows have is under the name of the metric with that of the data set.
+    The ratio is to the first row, paired by shape, or None. Data sets that all rows have get medians of the first
+    metric.
     """
     rows, names = grouped(sweep.runs.records, itemgetter("row")), sweep.metrics
     first = next(iter(rows.values()))
@@ -193,8 +189,8 @@ def _line(row: str, runs: list[Record], names: list[str]) -> dict[str, Any]:
 def median_of(runs: list[Record], metric: str) -> Interval | None:
     """The median of a metric over shapes and seeds with its interval; a failed run counts as the worst value.
 
-    If neither direction of the metric is better, only runs that have it count. None if a run that ended ok lacks the
-    metric, or no run has it.
+    If neither direction is better, only runs that have it count. None if a run that ended ok lacks it, or no run has
+    it.
     """
     values = {run_key(run): value for run in runs if (value := measured(run, metric)) is not None}
     if not values or any(run["status"] == "ok" and run_key(run) not in values for run in runs):
@@ -363,7 +359,6 @@ def _doubt(sweep: Sweep, intervals: dict[str, Interval], *, is_higher_better: bo
 
 
 def _failed(line: dict[str, Any]) -> str:
-    """How many runs failed, with the interval of their fraction if there is one; the caption has n."""
     count, total = line["failed"], line["runs"]
     return count_with_interval(count, total, line["rate"]) if line["rate"].has_ends else f"{count:g} of {total}"
 
@@ -422,17 +417,10 @@ def _command_overrides(plan: Plan, swept: dict[str, list[str]]) -> list[str]:
 
 
 def _number(value: str) -> float | None:
-    """The number that a text is; None for other texts."""
     try:
         return float(value)
     except ValueError:
         return None
-
-
-def _override_values(overrides: list[str]) -> dict[str, str]:
-    """The keys and values of a cell's overrides, without a leading plus sign."""
-    pairs = [override.partition("=") for override in overrides if "=" in override]
-    return {key.lstrip("+"): value for key, _, value in pairs}
 
 
 def _average_key(record: Record) -> RunKey:
@@ -443,8 +431,3 @@ def _average_key(record: Record) -> RunKey:
 
 def _studied() -> set[str]:
     return {selection.experiment for study in studies() for selection in study.reads}
-
-
-def _write(sweep: Sweep, folder: Path) -> list[Path]:
-    table = table_of(sweep)
-    return write(table, table.shown(), folder / TABLE, name=sweep.name)

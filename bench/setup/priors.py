@@ -36,12 +36,10 @@ class PriorChoice:
 
     @property
     def coloured(self) -> bool:
-        """Whether the prior has colours."""
         return isinstance(self.source, PriorSettings) and self.source.colour is not None
 
     @property
     def width(self) -> int:
-        """Neurons per layer."""
         return self.source.network.width if isinstance(self.source, PriorSettings) else self.source.decoder.width
 
     @property

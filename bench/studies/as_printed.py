@@ -4,7 +4,7 @@ from functools import partial
 
 import pandas as pd
 
-from bench.report.study import Result, Runs, Selection, compare
+from bench.report.study import Runs, Selection, compare
 
 PLACE = 22
 READS = (Selection("as_printed", ("task.points",), may_differ=("prior.truncation",)),)
@@ -33,32 +33,27 @@ Page = partial(compare.Comparison, hidden=("dense",))  # all runs have dense dep
 BACK = "default_"  # begins the presets of our default with one change back
 
 
-def _changes_of_default(runs: Runs) -> pd.Series:
+OF_PAPER = Page(
+    title="The paper's setting of DIST on dense depth, with changes.",
+    question="Which part of the paper's setting causes its error?",
+    reference="as_printed",
+    name="the paper's setting",
+    notes=lambda _: (*NOTES, *PAPER),
+)
+OF_DEFAULT = Page(
+    title="Our default setting of DIST on dense depth, with a change.",
+    question="Which part of our setting of DIST lowers the error?",
+    reference="dist_mask",
+    name="our default",
+    notes=lambda _: (*NOTES, *DEFAULT),
+)
+
+
+def _is_default(runs: Runs) -> pd.Series:
     return runs.frame.preset.str.startswith(BACK)
 
 
-def of_paper(runs: Runs) -> Result:
-    """The paper's setting with changes towards ours."""
-    page = Page(
-        title="The paper's setting of DIST on dense depth, with changes.",
-        question="Which part of the paper's setting causes its error?",
-        reference="as_printed",
-        name="the paper's setting",
-        notes=lambda _: (*NOTES, *PAPER),
-    )
-    return page(runs.where(~_changes_of_default(runs)))
-
-
-def of_default(runs: Runs) -> Result:
-    """Our default with one change back to the paper's setting."""
-    page = Page(
-        title="Our default setting of DIST on dense depth, with a change.",
-        question="Which part of our setting of DIST lowers the error?",
-        reference="dist_mask",
-        name="our default",
-        notes=lambda _: (*NOTES, *DEFAULT),
-    )
-    return page(runs.where(_changes_of_default(runs) | runs.frame.preset.isin(ALSO_SHOWN)))
-
-
-PAGES = {"as_printed": of_paper, "as_default": of_default}
+PAGES = {
+    "as_printed": lambda runs: OF_PAPER(runs.where(~_is_default(runs))),
+    "as_default": lambda runs: OF_DEFAULT(runs.where(_is_default(runs) | runs.frame.preset.isin(ALSO_SHOWN))),
+}

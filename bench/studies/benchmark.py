@@ -7,6 +7,7 @@ from bench.report.data.records import Record, measured, setting
 from bench.report.study import Result, Runs, Selection, format, table
 
 PLACE = 15
+COARSE = "coarse_queries"
 BASE = "base"  # prefix of the run's renderer in the metrics, as in bench.tasks.ablation
 READS = (
     Selection(
@@ -31,7 +32,6 @@ NOTES = (
 
 
 def make(runs: Runs) -> Result:
-    """A line per image size, number of threads and renderer."""
     # The task sets the number of threads: it is a column, not part of the caption.
     records = [record | {"environment": record["environment"] | {"threads": None}} for record in runs.records]
     lines = [line for record in sorted(records, key=_size_and_threads) for line in _lines(record)]
@@ -95,23 +95,17 @@ COLUMNS = (
     *table.columns(table.integer, size="Size", threads="Threads"),
     *table.columns(table.word, renderer="Renderer", status="", reason="", folder=""),
     *table.raw("rounds"),
-    table.Column(
-        "queries", "Field evaluations", words=lambda x: table.queries(x.get("queries"), x.get("coarse_queries"))
-    ),
-    *table.raw("coarse_queries"),
+    table.Column("queries", "Field evaluations", words=lambda x: table.queries(x.get("queries"), x.get(COARSE))),
+    *table.raw(COARSE),
     *table.columns(format.seconds, forward_seconds="Forward", step_seconds="Step"),
     *table.raw("forward_cpu", "step_cpu"),
     *map(_ratio, COSTS),
     *table.raw(*(f"{cost}_ratio_{end}" for cost in COSTS for end in table.ENDS), "peak_memory_bytes"),
     table.Column("work_over_bound", "Work over bound"),
     *table.raw("rays", "hits", "lost", "false", "wrong"),
-    table.shown(
-        "Missed / spurious / wrong depth", table.joined_cell(dict.get, table.integer, "lost", "false", "wrong")
-    ),
+    table.joined("Missed / spurious / wrong depth", dict.get, table.integer, "lost", "false", "wrong"),
     *table.raw("depth_error_median", "depth_error_p99", "depth_error_max"),
-    table.shown(
-        "Depth error median / p99", table.joined_cell(dict.get, format.number, "depth_error_median", "depth_error_p99")
-    ),
+    table.joined("Depth error median / p99", dict.get, format.number, "depth_error_median", "depth_error_p99"),
 )
 
 PAGES = {"benchmark": make}

@@ -186,7 +186,6 @@ NOTES = (
 
 
 def make(*sources: Runs | None) -> Result:
-    """A line for each claim of DIST and DVR."""
     question = "Which claims of the DIST and DVR papers hold in our measurements?"
     return page(CLAIMS, dict(zip(EXPERIMENTS, sources, strict=True)), "Claims of DIST and DVR.", question, NOTES)
 

@@ -4,17 +4,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.data.records import (
-    SHAPENET,
-    Record,
-    Row,
-    by_shape,
-    error,
-    grouped,
-    median_or_none,
-    row_of,
-    setting,
-)
+from bench.report.data.records import SHAPENET, Record, Row, by_shape, error, grouped, median_or_none, row_of, setting
 from bench.report.data.statistics import typical
 from bench.report.study import Result, Runs, Selection, compare, format, gallery, medians, published, table
 
@@ -64,8 +54,9 @@ PICTURE_COLUMNS = (table.FAMILY, *table.IDENTITY, *table.metrics("chamfer_l1", "
 
 
 def make(runs: Runs) -> Result:
-    """A line per family and row, and the published ones."""
-    runs = _of_usual_shapes(runs)
+    # Shapes that at least half of the rows of their family have, so that medians compare.
+    rows, all_rows = (runs.frame.groupby(keys)["row"].transform("nunique") for keys in (["family", "solid"], "family"))
+    runs = runs.where(2 * rows >= all_rows)
     family_lines = {name: _lines_of(runs, name) for name in runs.families()}
     lines = []
     for name, rows in family_lines.items():
@@ -87,12 +78,6 @@ def make(runs: Runs) -> Result:
         run_columns=RUNS,
         figure=draw(runs),
     )
-
-
-def _of_usual_shapes(runs: Runs) -> Runs:
-    """The runs of shapes that at least half of the rows of their family have, so that medians compare."""
-    rows, all_rows = (runs.frame.groupby(keys)["row"].transform("nunique") for keys in (["family", "solid"], "family"))
-    return runs.where(2 * rows >= all_rows)
 
 
 def longer(runs: Runs) -> Result:
@@ -127,7 +112,6 @@ def _verdict(family: str, lines: list[dict]) -> str:
 
 
 def draw(runs: Runs) -> Figure:
-    """A panel per family: the IoU of each shape, a line per row, and the median."""
     iou = medians.scored(runs, "iou")
     panels = {f"IoU, {name}": iou.where(runs.frame.family == name) for name in runs.families()}
     figure = medians.draw_runs(runs, panels, log=False)
@@ -137,7 +121,6 @@ def draw(runs: Runs) -> Figure:
 
 
 def figures(runs: Runs) -> Result:
-    """A line for a success and a failure of each family."""
     runs = runs.executed
     rows, by_scene = list(runs.rows()), grouped(runs.records, medians.scene_of)
     shown = {scene: end for group in runs.families().values() for scene, end in _ends(group, rows[0]).items()}

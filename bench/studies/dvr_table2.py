@@ -1,7 +1,6 @@
 """Table 2 and Figs. 6 to 8 of DVR: shape and colour from rendered photographs."""
 
 import math
-from collections.abc import Iterable
 from typing import Any
 
 from bench.records.published import DVR_TABLE2
@@ -57,17 +56,16 @@ ARRAYS = ("photograph", "colours", "normals", "hit")
 
 
 def make(runs: Runs) -> Result:
-    """A line per row, and the published ones."""
-    lines, scenes = sorted(medians.medians(runs, NAMES), key=_error), _scenes(runs)
+    lines = sorted(medians.medians(runs, NAMES), key=lambda x: math.inf if x[SEEN_ERROR] is None else x[SEEN_ERROR])
+    scenes = format.plural(len(grouped(runs.records, medians.scene_of)), "scene")
     published = [
         {"method": f"published: {name}", **dict(zip(NAMES, (value / CHAMFER_SCALE for value in values), strict=False))}
         for name, values in DVR_TABLE2.items()
     ]
     optimised = [record for record in runs.records if setting(record["config"], "task", "optimiser")]
-    panels = {
-        f"{SEEN_LABEL} (scene units)": CHAMFER_SCALE * medians.scored(runs, SEEN_ERROR),
-        **medians.cost(runs),
-    }
+    without_depth = [line for line in lines if not line["preset"].startswith(DEPTH_PRESETS)]
+    errors = {f"{SEEN_LABEL} (scene units)": CHAMFER_SCALE * medians.scored(runs, SEEN_ERROR)}
+    rows = [Row(line["preset"], line["method"]) for line in lines]
     return Result(
         runs,
         "Shape and colour from photographs.",
@@ -76,9 +74,7 @@ def make(runs: Runs) -> Result:
         question="Which method best reconstructs shape and colour from photographs?",
         verdict=table.extremes(
             "Median Chamfer-L1 × 1000 of the seen surface, without depth",
-            medians.comparable_medians(
-                [line for line in lines if not line["preset"].startswith(DEPTH_PRESETS)], SEEN_ERROR
-            ),
+            medians.comparable_medians(without_depth, SEEN_ERROR),
             scenes,
             show=table.thousandfold,
         ),
@@ -86,7 +82,7 @@ def make(runs: Runs) -> Result:
         columns=COLUMNS,
         lines=[*lines, *published],
         run_columns=RUNS,
-        figure=medians.draw_runs(runs, panels, [Row(line["preset"], line["method"]) for line in lines]),
+        figure=medians.draw_runs(runs, errors | medians.cost(runs), rows),
     )
 
 
@@ -97,41 +93,21 @@ def _settings(records: list[Record]) -> str:
         for name, path in NOTED_SETTINGS.items()
     }
     shared = [f"{name} {next(iter(each))}" for name, each in values.items() if len(each) == 1]
-    differ = [f"{name} ({', '.join(_ordered(each.values()))})" for name, each in values.items() if len(each) > 1]
+    differ = []
+    for name, each in values.items():
+        ordered = sorted(each.values(), key=lambda x: (1, str(x)) if as_number(x) is None else (0, x))
+        differ += [f"{name} ({', '.join(map(str, ordered))})"] if len(each) > 1 else []
     parts = [("Rows share: ", shared), ("Rows differ in: ", differ)]
     return " ".join(f"{word}{', '.join(listed)}." for word, listed in parts if listed)
 
 
-def _ordered(values: Iterable[Any]) -> list[str]:
-    """Values as text: numbers sorted by size, then words."""
-    return [str(value) for value in sorted(values, key=lambda x: (1, str(x)) if as_number(x) is None else (0, x))]
-
-
 def _partial_rows(lines: list[dict[str, Any]]) -> str:
-    """A note on rows without all scenes; empty without such rows."""
     count = max((line["runs"] for line in lines), default=0)
     partial = [f"{line['method']} ({line['runs']} of {count})" for line in lines if line["runs"] < count]
     return f"Do not compare the medians of rows without all scenes: {'; '.join(partial)}." if partial else ""
 
 
-def _error(line: dict[str, Any]) -> float:
-    return math.inf if line[SEEN_ERROR] is None else line[SEEN_ERROR]
-
-
-def _distinct(runs: Runs) -> dict[Row, list[Record]]:
-    """The rows except `LOOKALIKES`; all rows if nothing else is left."""
-    distinct = {
-        row: group for row, group in runs.rows().items() if row.preset.removeprefix(TUNED_PREFIX) not in LOOKALIKES
-    }
-    return distinct or runs.rows()
-
-
-def _scenes(runs: Runs) -> str:
-    return format.plural(len(grouped(runs.records, medians.scene_of)), "scene")
-
-
 def _photograph_settings(runs: Runs) -> str:
-    """The settings of the photographs, and the numbers of iterations."""
     tasks = [r["config"]["task"] for r in runs.records if setting(r["config"], "task", "optimiser")]
     if not tasks or setting(tasks[0], "images", "views") is None:
         return ""
@@ -143,8 +119,8 @@ def _photograph_settings(runs: Runs) -> str:
 
 
 def figures(runs: Runs) -> Result:
-    """The first scenes in pictures, without rows that look like another."""
-    rows, by_scene = list(_distinct(runs)), grouped(runs.records, medians.scene_of)
+    distinct = [row for row in runs.rows() if row.preset.removeprefix(TUNED_PREFIX) not in LOOKALIKES]
+    rows, by_scene = distinct or list(runs.rows()), grouped(runs.records, medians.scene_of)
     shown = {
         name: {row_of(record): record for record in group if row_of(record) in rows}
         for name, group in list(by_scene.items())[:MAX_SCENES]
@@ -167,14 +143,13 @@ def figures(runs: Runs) -> Result:
 
 
 def _block(name: str, rows: list[Row], record_of: dict[Row, Record], scene: gallery.Scene) -> gallery.Block:
-    """The colours of each row beside the photograph and, below, its normals."""
     paints = {"colours": gallery.colours(), "normals": gallery.normals()}
-    cells = {kind: [scene.cell(record_of.get(row), paint) for row in rows] for kind, paint in paints.items()}
     photograph = scene.shared(record_of.values(), lambda arrays: [arrays["photograph"]])
     first = {"colours": photograph, "normals": gallery.Cell()}
-    return gallery.Block(
-        name, ["held out", *(row.name for row in rows)], {kind: [first[kind], *cells[kind]] for kind in paints}
-    )
+    cells = {
+        kind: [first[kind], *(scene.cell(record_of.get(row), paint) for row in rows)] for kind, paint in paints.items()
+    }
+    return gallery.Block(name, ["held out", *(row.name for row in rows)], cells)
 
 
 PAGES = {"dvr_table2": make, "dvr_figures": figures}

@@ -39,7 +39,6 @@ Line = dict[str, Any]
 
 
 def make(runs: Runs) -> Result:
-    """Errors and costs of completions relative to those of the same renderer at full effort."""
     compared = compare.Compared(runs, FULL["dist_needed"])
     frame = runs.frame.assign(cost=runs.number("evaluations_cost"))
     lines = _lines(compared, frame[frame.status == "ok"].pivot_table("cost", ["family", "solid", "seed"], "row"))
@@ -76,24 +75,18 @@ def _lines(compared: compare.Compared, costs: Any) -> list[Line]:
         for row in rows:
             full = of_preset.get(FULL.get(row.preset, ""))
             cost = shown[row.name].median() if row.name in shown else math.nan
+            is_shown = full is not None and {row.name, full.name} <= {*shown}
+            costs_of_both = [shown[each.name].dropna() for each in (row, full)] if is_shown else []
             lines.append(
                 line_of[family, row.preset, row.name]
                 | {"row": NAMES.get(row.preset, row.name), "cost": None if math.isnan(cost) else cost}
                 | {"ratio": compared.gap(family, row, full) if full else None}
-                | {"cost_ratio": _cost_ratio(shown, row.name, full.name) if full else None}
+                | {"cost_ratio": statistics.common_ratio(*costs_of_both) if costs_of_both else None}
             )
     return lines
 
 
-def _cost_ratio(costs: Any, row: str, full: str) -> statistics.Interval | None:
-    """The ratio of two rows' costs on the shapes on which both ended ok; None without any."""
-    if not {row, full} <= {*costs}:
-        return None
-    return statistics.common_ratio(costs[row].dropna(), costs[full].dropna())
-
-
 def _verdict(pooled: list[Line]) -> str:
-    """The ratios of costs and errors for the rows of `HEADLINES`, and the errors that differ significantly."""
     sentences = []
     for beginning, presets in HEADLINES.items():
         parts = [_costs(line) for line in pooled if line["preset"] in presets and line["ratio"]]
@@ -109,7 +102,6 @@ def _costs(line: Line) -> str:
 
 
 def _panel(pooled: list[Line]) -> chart.Panel:
-    """Error ratio over cost ratio: a point per row, and the renderers at full effort at 1 and 1."""
     points = [
         chart.series(line["row"], line["preset"], [line["cost_ratio"].value], [line["ratio"].ratio])
         for line in pooled

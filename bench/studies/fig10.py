@@ -24,7 +24,6 @@ NOTES = (
 
 
 def make(runs: Runs) -> Result:
-    """A line per family, method and value of a condition."""
     lines = conditions.lines_of(runs.executed.records, CONDITIONS)
     return Result(
         runs,
@@ -55,7 +54,7 @@ def draw(lines: Sequence[dict[str, Any]]) -> Figure:
 
 
 def _ratios(lines: Sequence[dict[str, Any]]) -> dict[float, statistics.Interval]:
-    """For each value of a condition, the ratio of a method's errors to its errors on the same shapes at value 1."""
+    """Of a method's errors to its errors on the same shapes at value 1, by value of a condition."""
     errors = {
         value: medians.errors_of((run for line in value_lines for run in line["runs"]), records.ONE_WAY)
         for value, value_lines in sorted(records.grouped(lines, lambda line: line["value"]).items())

@@ -34,23 +34,16 @@ UNITS = {"shift": "shifted by {:g}", "degrees": "turned by {:g}°", "scale": "{:
 
 def is_place_known(record: Record) -> bool:
     """Whether a run began in place, and optimised no similarity."""
-    return not setting(record["config"], "task", "similarity") and all(
-        c.value_of(record) == c.neutral for c in CONDITIONS
-    )
+    is_neutral = all(condition.value_of(record) == condition.neutral for condition in CONDITIONS)
+    return is_neutral and not setting(record["config"], "task", "similarity")
 
 
 def make(runs: Runs) -> Result:
-    """A line per family, method and value of a condition."""
     lines = conditions.lines_of([record for record in runs.executed.records if not is_place_known(record)], CONDITIONS)
     records_by_row = grouped(filter(is_place_known, runs.records), lambda record: (family(record), row_of(record)))
     lines_of_known = [
-        {
-            "family": name,
-            "method": row.name,
-            "condition": PLACE_KNOWN,
-            "runs": group,
-            "error": conditions.median_error(group),
-        }
+        {"family": name, "method": row.name, "condition": PLACE_KNOWN}
+        | {"runs": group, "error": conditions.median_error(group)}
         for (name, row), group in records_by_row.items()
     ]
     return Result(
@@ -74,7 +67,6 @@ def make(runs: Runs) -> Result:
 
 
 def draw(lines: Sequence[dict[str, Any]]) -> Figure:
-    """Draws a row of panels per family: the error over each condition, a line per method, and the largest success."""
     lines_by_family, panels = grouped(lines, lambda line: line["family"]), []
     for (name, family_lines), condition in product(lines_by_family.items(), CONDITIONS):
         shown = [line for line in family_lines if line["key"] == condition.key]
@@ -93,11 +85,10 @@ def _succeeded(record: Record) -> bool:
 
 
 def _successes(records: Sequence[Record]) -> str:
-    by_shape = [[_succeeded(run) for run in runs] for runs in grouped(records, solid).values()]
-    successes = list(map(sum, by_shape))
-    return table.count_with_interval(
-        sum(successes), len(records), statistics.share(successes, list(map(len, by_shape)))
-    )
+    shapes = grouped(records, solid).values()
+    successes = [sum(map(_succeeded, runs)) for runs in shapes]
+    rate = statistics.share(successes, [len(runs) for runs in shapes])
+    return table.count_with_interval(sum(successes), len(records), rate)
 
 
 def _verdict(runs: Runs) -> str:
@@ -120,12 +111,10 @@ def _verdict(runs: Runs) -> str:
 
 
 def _shares(chosen: list[Record]) -> dict[str, float]:
-    """The fraction of successes of each row."""
     return {row.name: sum(map(_succeeded, group)) / len(group) for row, group in grouped(chosen, row_of).items()}
 
 
 def pictures(runs: Runs) -> Result:
-    """A block per family: the start over the displacement, and below it the shape of each row."""
     first = gallery.first_shapes(runs, 1)
     scenes = {name: gallery.Scene(first, records, gallery.SHAPES) for name, records in first.families().items()}
     return Result(

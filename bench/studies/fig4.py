@@ -17,7 +17,6 @@ COLUMNS = (  # a line is a record and the counts of its picture
 
 
 def make(runs: Runs) -> Result:
-    """The reference and a column per row; rows without pictures keep their place."""
     chosen = runs.of_newest_scene()
     comparison = gallery.compare_with_reference(chosen, MAX_COLUMNS)
     data = table.to_data(COLUMNS, zip(chosen.records, comparison.counts, strict=True))

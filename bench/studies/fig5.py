@@ -93,7 +93,6 @@ def _end_errors(histories: list[pd.DataFrame], failed: list[bool]) -> dict[str, 
 
 
 def _loss(runs: Runs) -> str:
-    """The terms of the loss, and whether those of different rows can be compared."""
     weight, width = (setting(runs.requested(), "task", f"normal_{name}") for name in ("weight", "width"))
     normals = f"depths, normals over {width} scene units (weight {weight or 0:g}) and silhouette, as in DIST, Fig. 5"
     terms = normals if weight else "depths and the silhouette; DIST, Fig. 5, also has normals"
@@ -102,7 +101,6 @@ def _loss(runs: Runs) -> str:
 
 
 def draw(medians: dict[Row, Medians], axes: list[str]) -> Figure:
-    """Draws loss above and Chamfer below, over iterations and seconds, a line per row."""
     panels = []
     for (name, (label, scale)), axis in product(QUANTITIES.items(), axes):
         lines = [
@@ -116,9 +114,8 @@ def draw(medians: dict[Row, Medians], axes: list[str]) -> Figure:
 def _data(runs: Runs, histories: dict[str, pd.DataFrame], medians: dict[Row, Medians], lines: list) -> pd.DataFrame:
     """The CSV, with three kinds of lines: runs, medians over a row's runs, and a row's rank correlation."""
     rows: list[dict[str, Any]] = []
-    for record, identity in zip(
-        runs.records, table.to_data(table.IDENTITY, runs.records).to_dict("records"), strict=True
-    ):
+    identities = table.to_data(table.IDENTITY, runs.records).to_dict("records")
+    for record, identity in zip(runs.records, identities, strict=True):
         rows += [{"kind": "run", **identity, **point} for point in _points(histories[record["folder"]]) or [{}]]
     for (row, by_name), line in zip(medians.items(), lines, strict=True):
         for name, curve in by_name.items():
@@ -130,7 +127,6 @@ def _data(runs: Runs, histories: dict[str, pd.DataFrame], medians: dict[Row, Med
 
 
 def _points(line: pd.DataFrame) -> list[dict[str, Any]]:
-    """The lines of a curve, with counts as integers."""
     counts = ("iteration", "value_evaluations")
     return [
         {name: int(x) if name in counts and math.isfinite(x) else x for name, x in point.items()}

@@ -31,7 +31,6 @@ RUNS = (
 
 
 def make(runs: Runs) -> Result:
-    """A line per method: its success rate at each angle, and its costs."""
     poses = _poses(runs.executed)
     rows = dict(list(poses.groupby(["row", "preset"], sort=False)))
     angles = sorted(poses.degrees.unique())
@@ -59,7 +58,6 @@ def make(runs: Runs) -> Result:
 
 
 def _poses(runs: Runs) -> pd.DataFrame:
-    """A line per run: row, shape, angle, whether the pose was found, and costs; a failed run found no pose."""
     ok = (runs.frame.status == "ok").to_numpy(bool)
     return runs.frame[["row", "preset", "family", "solid"]].assign(
         degrees=runs.number("config.task.degrees"),
@@ -71,7 +69,6 @@ def _poses(runs: Runs) -> pd.DataFrame:
 
 
 def _verdict(poses: pd.DataFrame) -> str:
-    """The rows with the most and the fewest cameras found from the largest angle, for each number of starts."""
     farthest, shapes = poses.degrees.max(), format.plural(len(poses[["family", "solid"]].drop_duplicates()), "shape")
     sentences = []
     for starts, group in poses[poses.degrees == farthest].groupby("starts"):
@@ -98,7 +95,6 @@ def _share(poses: pd.DataFrame | None) -> str:
 
 
 def draw(rows: dict[tuple[str, str], pd.DataFrame]) -> Figure:
-    """Draws the rates without their intervals, which would hide each other."""
     lines = []
     for (row, preset), poses in rows.items():
         rates = {angle: 100 * _rate(angle_poses).value for angle, angle_poses in poses.groupby("degrees")}

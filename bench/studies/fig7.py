@@ -17,20 +17,18 @@ COUNTED = ("size", "hits", "lost", "false")  # from the record, or if missing fr
 
 
 def make(runs: Runs) -> Result:
-    """A column of pictures and a line per epsilon, the largest first."""
     chosen = runs.of_newest_scene()
     chosen = replace(chosen, records=sorted(chosen.records, key=lambda record: -(_epsilon(record) or -math.inf)))
     comparison = gallery.compare_with_reference(chosen, MAX_COLUMNS)
     lines = [(record, _counts(record, shown)) for record, shown in zip(chosen.records, comparison.counts, strict=True)]
+    sound = [counts | {"epsilon": _epsilon(record)} for record, counts in lines if record["status"] == "ok"]
     return Result(
         chosen,
         "Missed and spurious pixels by the convergence threshold.",
         "Pictures from the largest to the smallest epsilon: normals (right, up, towards the camera as red, green, "
         "blue), and below their angle to the normals of the reference.",
         question="Which convergence threshold gives the fewest wrong pixels?",
-        verdict=_verdict(
-            [counts | {"epsilon": _epsilon(record)} for record, counts in lines if record["status"] == "ok"]
-        ),
+        verdict=_verdict(sound),
         remarks=(*comparison.missing, *NOTES),
         columns=COLUMNS,
         lines=lines,

@@ -37,7 +37,6 @@ COLUMNS = (
 
 
 def make(runs: Runs) -> Result:
-    """A line per shape, and pictures of its mesh, its training code, and the code optimised from one image."""
     code, *mesh_and_texture, network = (runs.number(key).median() for key in SIZES)
     errors = runs.number("colour_error").groupby(runs.setting("split"), sort=False).median()
     texts = ", ".join(f"*{error:.2g}* ({split})" for split, error in errors.items())

@@ -30,7 +30,6 @@ Line = dict[str, Any]
 
 
 def make(runs: Runs) -> Result:
-    """A line per renderer: the sums or medians over all cameras."""
     rows = runs.executed.rows()
     lines = [_line(row.name, row.preset, of_row) for row, of_row in rows.items()]
     return Result(
@@ -50,7 +49,6 @@ def make(runs: Runs) -> Result:
 
 
 def make_pictures(runs: Runs) -> Result:
-    """A column of pictures per renderer, from the first camera."""
     first = min(map(_azimuth, runs.records))
     chosen = runs.only([record for record in runs.records if _azimuth(record) == first])
     comparison = gallery.compare_with_reference(chosen, MAX_COLUMNS)
@@ -70,9 +68,8 @@ def _line(name: str, preset: str, of_row: list[records.Record]) -> Line:
     line = {"renderer": name, "preset": preset, "cameras": len(of_row), "failed": len(failed)}
     line |= {key: None if None in values else sum(values) for key, values in sums.items()}
     line |= {key: records.median_or_none(records.measured(record, key) for record in ok) for key in MEDIANS}
-    line["fraction"] = (
-        line["pixel_errors"] / line["hits"] if line["hits"] and line["pixel_errors"] is not None else None
-    )
+    has_fraction = line["hits"] and line["pixel_errors"] is not None
+    line["fraction"] = line["pixel_errors"] / line["hits"] if has_fraction else None
     return line | {"reason": failed[0]["reason"] if failed else ""}
 
 
@@ -83,7 +80,9 @@ def _verdict(rows: dict[records.Row, list[records.Record]], lines: list[Line]) -
     complete = {row.name: sorted(of_row, key=_azimuth) for row, of_row in rows.items() if row.name in all_ok}
     kept = {name: _line(name, "", of_row[: max(cameras - 1, 1)]) for name, of_row in complete.items()}
     cost = {line["renderer"]: line["cost"] for line in lines}
-    good = sorted((name for name, line in kept.items() if _is_good(line)), key=lambda name: cost[name])
+    fractions = {name: line["fraction"] for name, line in kept.items() if line["fraction"] is not None}
+    good = [name for name, fraction in fractions.items() if fraction <= MAX_WRONG_FRACTION_OF_HITS]
+    good.sort(key=lambda name: cost[name])
     if not good:
         fractions = {line["renderer"]: line["fraction"] for line in lines}
         return table.extremes("Wrong pixels, of all hits", fractions, f"{cameras} cameras", show=table.small_percent)
@@ -104,12 +103,7 @@ def _azimuth(record: records.Record) -> float:
     return records.setting(record["config"], "view", "azimuth")[0]
 
 
-def _is_good(line: Line) -> bool:
-    return line["fraction"] is not None and line["fraction"] <= MAX_WRONG_FRACTION_OF_HITS
-
-
 def _panels(lines: list[Line], *, timed: bool) -> list[chart.Panel]:
-    """A point per renderer, over field evaluations and, on a quiet machine, over the rendering's seconds."""
     axes = {"cost": "field evaluations of a rendering"} | ({"forward_seconds": "runtime (seconds)"} if timed else {})
     panels = []
     for key, title in axes.items():
@@ -127,9 +121,7 @@ def _panels(lines: list[Line], *, timed: bool) -> list[chart.Panel]:
 COLUMNS = (
     *table.columns(table.word, renderer="Renderer"),
     table.Column("fraction", "Wrong pixels", show=table.small_percent, better="lower"),
-    table.shown(
-        "Missed / spurious / wrong depth", table.joined_cell(dict.get, table.integer, "lost", "false", "wrong")
-    ),
+    table.joined("Missed / spurious / wrong depth", dict.get, table.integer, "lost", "false", "wrong"),
     *table.raw(*SUMMED[:-1]),
     table.Column("out_of_steps", "Out of steps", show=table.integer),
     table.Column("depth_error_median", "Median depth error"),

@@ -51,7 +51,6 @@ VISIBLE_NOTES = (
 
 
 def make(runs: Runs) -> Result:
-    """A line per renderer and band, also of failed runs."""
     data = _band_lines(runs, BANDS, NUMBERS)
     unseen = int((data.loc[data["band"].isin(ANGLES), ["code_median_error", "camera_median_error"]] == 0).sum().sum())
     return Result(
@@ -71,7 +70,6 @@ def make(runs: Runs) -> Result:
 
 
 def make_visibility(runs: Runs) -> Result:
-    """A line per renderer and blur, also of failed runs."""
     data = _blur_lines(runs)
     return Result(
         runs,
@@ -110,7 +108,6 @@ def _blur_lines(runs: Runs) -> pd.DataFrame:
 
 
 def _verdict(data: pd.DataFrame) -> str:
-    """The smallest pooled cosine of each renderer in the bands of hits."""
     hits = data[data["band"].isin(ANGLES)]
     cosines = hits["code_pooled_cosine"].where(hits["status"] == "ok").groupby(hits["name"], sort=False)
     least = cosines.min(min_count=len(ANGLES))  # NaN if a band is missing
@@ -122,7 +119,6 @@ def _verdict(data: pd.DataFrame) -> str:
 
 
 def _visibility_verdict(data: pd.DataFrame) -> str:
-    """The best cosine at the outline, and the best of the renderers that differentiate hits only."""
     measured = data[(data["status"] == "ok") & data["image_cosine"].notna()]
     blurred, sharp = measured[measured["blur"].notna()], measured[measured["blur"].isna()]
     parts = []
@@ -139,7 +135,6 @@ def _visibility_verdict(data: pd.DataFrame) -> str:
 
 
 def draw(data: pd.DataFrame) -> Figure:
-    """Draws a line per renderer: the median errors of each band for code and camera, and the silhouette's numbers."""
     status = dict(zip(data["name"], data["status"], strict=True))
     rows = [name if end == "ok" else f"{name} ({end.replace('_', ' ')})" for name, end in status.items()]
 
@@ -162,7 +157,6 @@ def draw(data: pd.DataFrame) -> Figure:
 
 
 def draw_visibility(data: pd.DataFrame) -> Figure:
-    """Draws cosine and scale over the blur, a line per renderer; renderers without a blur are a range."""
     sharp, blurs, panels = data[data["blur"].isna() & data["image_cosine"].notna()], data["blur"].dropna(), []
     for name in IMAGE_METRICS if len(blurs) else ():
         lines = [

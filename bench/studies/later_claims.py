@@ -62,7 +62,6 @@ NOTES = (
 
 
 def make(runs: Runs | None) -> Result:
-    """A line for each claim."""
     question = "Which claims of papers after 2020 hold in our measurements?"
     return page(CLAIMS, {EXPERIMENT: runs}, "Claims of later papers.", question, NOTES)
 

@@ -125,7 +125,6 @@ def _candidates(line: Line) -> list[Line]:
 
 
 def _falling(lines: list[Line]) -> str:
-    """A sentence on the fits that were stopped while their error still fell."""
     labels = [candidate.label for line in lines for candidate in line["candidates"].results if candidate.is_falling]
     counts = ", ".join(f"{label} in {labels.count(label)}" for label in dict.fromkeys(labels))
     return f"Not converged (the last round still reduced the error), in runs: {counts}." if labels else ""
@@ -207,7 +206,6 @@ def _point(line: Line, candidate: CandidateResult) -> chart.Series:
 
 @figure_style.styled
 def draw(panels: list[chart.Panel], labels: list[Labels]) -> Figure:
-    """Draws a panel per scene, with the names of the chosen candidates; the legend also has sizes of markers."""
     rows = -(-len(panels) // (2 if len(panels) <= MAX_PANELS_IN_TWO_COLUMNS else 3))
     figure = chart.draw(panels, 2.0 * rows + 1.1, rows, legend=0, sharey=True, sharex=True)
     for axis, names in zip(figure.axes, labels, strict=False):
@@ -232,7 +230,6 @@ def draw(panels: list[chart.Panel], labels: list[Labels]) -> Figure:
 
 
 def _chosen(line: Line, choice: str) -> str:
-    """A choice with its cost and its error times 1000; or whether it was not checked on further views."""
     cost, by_pixel, *_ = CHOICES[choice]
     candidate = line.get(choice)
     if candidate is None:
@@ -243,7 +240,6 @@ def _chosen(line: Line, choice: str) -> str:
 
 
 def _best(line: Line) -> str:
-    """The candidate of the least error with its numbers, or the problem of the run."""
     if not line["ok"]:
         return line["problem"]
     best = line["candidates"].best

@@ -24,7 +24,6 @@ Line = dict[str, Any]
 
 
 def make(runs: Runs) -> Result:
-    """A line per family and prior, those over all families first."""
     lines = _lines(runs, compare.Compared(runs, ""))
     pooled = compare.pooled(lines)
     panels = _panels(pooled)
@@ -45,7 +44,6 @@ def make(runs: Runs) -> Result:
 
 
 def _lines(runs: Runs, compared: compare.Compared) -> list[Line]:
-    """The lines of the comparison with the sizes of priors, the smallest first, and ratios to the largest prior."""
     sizes = {row: _size(of_row[0]["config"]["prior"]["network"]) for row, of_row in runs.rows().items()}
     by_size = sorted(sizes, key=lambda row: (sizes[row]["weights"], sizes[row]["code"]))
     largest = {row.preset: row for row in by_size}
@@ -65,7 +63,6 @@ def _presets(lines: list[Line]) -> list[str]:
 
 
 def _size(network: dict[str, Any]) -> Line:
-    """The network in words, the length of its code, and the number of its weights."""
     layers, width, code = (network[key] for key in ("layers", "width", "code_length"))
     return {"network": f"{layers} × {width}", "code": code, "weights": weights(**network)}
 
@@ -106,7 +103,6 @@ def _verdict(lines: list[Line]) -> str:
 
 
 def _panels(pooled: list[Line]) -> list[chart.Panel]:
-    """Error and FLOPs over the length of the code: a line per network and renderer."""
     several = len(_presets(pooled)) > 1
     panels = []
     for key, title in (("error", compare.LABEL), ("flops", "FLOPs of a run")):

@@ -35,7 +35,6 @@ COLUMNS = (
 
 
 def make(runs: Runs) -> Result:
-    """A line per family: the fit of its shapes, and the floor."""
     ratios = [_ratio(record) if record["status"] == "ok" else None for record in runs.records]
     values = runs.frame[["family"]].assign(
         **{name: runs.error(name, 1) for name in DEFINED},
@@ -64,7 +63,6 @@ def make(runs: Runs) -> Result:
 
 
 def _block(runs: Runs, name: str, shown: list[records.Record]) -> gallery.Block:
-    """The truth and the fit of each record, titled by the ratio of the fit's error to the floor."""
     cells, titles = [], []
     for record in shown:
         scene, ratio = gallery.Scene(runs, [record], gallery.REFERENCE), _ratio(record)

@@ -29,7 +29,6 @@ Line = dict[str, Any]  # a setting of a renderer, with its records and histories
 
 
 def make(runs: Runs) -> Result:
-    """A line per setting: its runs, how many reached the target, and their median time."""
     lines = [_line(runs, records) | {"setting": row.name, "preset": row.preset} for row, records in runs.rows().items()]
     identity_columns = (*table.IDENTITY, table.FAMILY)
     data = [
@@ -73,7 +72,6 @@ def time_to(history: pd.DataFrame, record: Record) -> float:
 
 
 def _verdict(lines: list[Line]) -> str:
-    """The times of the settings that reach the target in most runs."""
     reached = {line["setting"]: line["time"] for line in lines if math.isfinite(line["time"])}
     title = f"Median time to an error of {CHAMFER_SCALE * TARGET_ERROR:g} (Chamfer × 1000)"
     n = min(line["runs"] for line in lines)

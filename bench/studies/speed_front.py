@@ -60,7 +60,6 @@ RENDERING = Trial(
 
 
 def make(completion: Runs | None, rendering: Runs | None) -> Result:
-    """A point per setting: its median error and seconds, and its probability on the front."""
     runs_by_trial = {COMPLETION: completion, RENDERING: rendering}
     panels = {trial: points(runs, trial) for trial, runs in runs_by_trial.items() if runs is not None}
     lines = [line for panel in panels.values() for line in panel]
@@ -83,7 +82,6 @@ def make(completion: Runs | None, rendering: Runs | None) -> Result:
 
 
 def points(runs: Runs, trial: Trial) -> list[Line]:
-    """A line per setting, in the order of their runs."""
     keys = sorted({records.run_key(record) for record in runs.records}, key=str)
     cells = _cells(runs, trial, keys)
     groups = {
@@ -136,12 +134,10 @@ def _finite(panel: list[Line]) -> list[Line]:
 
 
 def _front(panel: list[Line]) -> list[Line]:
-    """The lines on the front, from the fastest to the best."""
     return sorted((line for line in _finite(panel) if not line["dominated"]), key=lambda line: line["seconds"])
 
 
 def _verdict(panels: dict[Trial, list[Line]]) -> str:
-    """The ends of the first non-empty front; empty if all fronts are empty."""
     for trial, panel in panels.items():
         if front := _front(panel):
             ends = [
@@ -158,7 +154,6 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
 
 @figure_style.styled
 def draw(panels: list[chart.Panel], fronts: list[list[Line]]) -> Figure:
-    """Draws a panel per trial; settings on the front are numbered, with their names below."""
     figure = chart.draw(panels, 4.4, legend=5)
     for legend in figure.legends:
         for handle in legend.legend_handles:
@@ -176,12 +171,10 @@ def draw(panels: list[chart.Panel], fronts: list[list[Line]]) -> Figure:
 
 
 def _name(line: Line) -> str:
-    """The setting, and the probability of being on the front if it is known."""
     return line["setting"] + ("" if math.isnan(line["on_front"]) else f" ({line['on_front']:.2f})")
 
 
 def _panel(trial: Trial, panel: list[Line]) -> dict[str, Any]:
-    """For each renderer a series on the front and a dominated series; and the line of the front."""
     drawn, axes = [], ("seconds", "error")
     names = {line["renderer"]: line["setting"].partition(",")[0] for line in reversed(panel)}  # of the first setting
     for (renderer, dominated), settings in records.grouped(
@@ -196,7 +189,6 @@ def _panel(trial: Trial, panel: list[Line]) -> dict[str, Any]:
 
 
 def _hover(line: Line) -> list[str]:
-    """The text that appears when the mouse points at a setting."""
     return [
         _name(line),
         f"{format.seconds(line['seconds'])}, error × 1000 {format.number(line['error'])}",

@@ -90,7 +90,6 @@ def make(runs: Runs) -> Result:
 
 
 def _data(runs: Runs, cells: pd.DataFrame, axes: pd.DataFrame) -> pd.DataFrame:
-    """A line per axis and renderer with all metrics, axis by axis."""
     names = dict.fromkeys(name for record in runs.records for name in record["metrics"])
     metrics = {name: [record["metrics"].get(name) for record in runs.records] for name in names if FAILED not in name}
     kinds = [
@@ -168,7 +167,6 @@ def _ray_command(record: records.Record) -> str:
 
 @figure_style.styled
 def draw(cells: pd.DataFrame, axes: pd.DataFrame, rows: list[str]) -> Figure:
-    """Draws the heat map, a line per renderer and a column per axis, in two blocks; darker survives harder cases."""
     shades, marks = (breakdowns.grid(cells, axes, name).reindex(columns=rows) for name in ("shade", "mark"))
     blocks = _in_two([list(names) for names in axes.groupby("group", sort=False).groups.values()])
     widest = max(sum(map(len, block)) + GROUP_GAP_COLUMNS * (len(block) - 1) for block in blocks)
@@ -202,7 +200,6 @@ def _mark_handle(mark: str) -> tuple[Line2D, Line2D]:
 
 
 def _draw_block(panel: Axes, groups: list[list[str]], shades: pd.DataFrame, marks: pd.DataFrame) -> None:
-    """Draws groups of axes side by side, with the names of axes above and those of renderers on the left."""
     start, positions = 0.0, []
     for names in groups:
         image = np.ma.masked_invalid(shades.loc[names].to_numpy(float).T)
@@ -240,7 +237,6 @@ def _in_two(groups: list[list[str]]) -> list[list[list[str]]]:
 
 
 def _group_titles(groups: list[list[str]], group_of: pd.Series) -> list[tuple[str, float]]:
-    """The title of each group of a block, and the position of its middle."""
     starts = np.cumsum([0.0, *(len(names) + GROUP_GAP_COLUMNS for names in groups)])
     keys = [str(group_of[names[0]]) for names in groups]
     middles = [start + (len(names) - 1) / 2 for start, names in zip(starts, groups, strict=False)]
@@ -248,7 +244,6 @@ def _group_titles(groups: list[list[str]], group_of: pd.Series) -> list[tuple[st
 
 
 def _extremes_of(cells: pd.DataFrame) -> dict[str, Any]:
-    """The two axes on which a renderer breaks first, and the one on which it is best, each with its cell or None."""
     breaking = cells[~cells["never"]].sort_values(["shade", "median"], ascending=[True, False])
     first, second, *_ = [*breaking.itertuples(), None, None]
     lead = cells.assign(lead=cells["shade"] - cells["median"]).sort_values(["lead", "shade"], ascending=False)
@@ -256,8 +251,6 @@ def _extremes_of(cells: pd.DataFrame) -> dict[str, Any]:
 
 
 def _share_words(key: str) -> Callable[[dict[str, Any]], str]:
-    """A function that writes the axis of a line's cell, and its breakdown as a share of the axis with its interval."""
-
     def words(line: dict[str, Any]) -> str:
         if (cell := line[key]) is None:
             return format.MISSING

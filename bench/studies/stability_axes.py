@@ -47,7 +47,6 @@ COST_COLUMNS = (
 
 
 def make_axes(runs: Runs) -> Result:
-    """A line per axis and a column per row, with the breakdown and its interval."""
     runs = runs.of_newest_scene()
     cells = breakdowns.cells_of(runs)
     axes, rows = breakdowns.axes_of(cells), list(cells["row"].unique())
@@ -79,7 +78,6 @@ def make_axes(runs: Runs) -> Result:
 
 
 def make_cost(runs: Runs) -> Result:
-    """A line and a point per renderer: its mean rank over the axes, and its field values per ray."""
     runs = runs.of_newest_scene()
     cells = breakdowns.cells_of(runs)
     cells = cells[cells["row"].isin(breakdowns.ranked_rows(runs))]
@@ -122,14 +120,11 @@ def make_curves(runs: Runs) -> Result:
     for axis, axis_data in data.groupby("axis", sort=False):
         lines = []
         for (row, preset), points in axis_data.groupby(["row", "preset"], sort=False):
-            texts = [
-                f"{x.successes:.0f} of {x.trials:.0f} succeed at {format.number(x.severity)}"
-                for x in points.itertuples()
-            ]
+            trials = [f"{x.successes:.0f} of {x.trials:.0f} succeed" for x in points.itertuples()]
+            texts = [f"{x} at {format.number(level)}" for x, level in zip(trials, points["severity"], strict=True)]
             lines.append(chart.curve(row, preset, points["severity"], 100 * points["share"], size=5, text=texts))
-        panels.append(
-            chart.panel_data(breakdowns.title(axis), "severity", "successes (%)", lines, height=300, axis=axis)
-        )
+        title = breakdowns.title(axis)
+        panels.append(chart.panel_data(title, "severity", "successes (%)", lines, height=300, axis=axis))
     return Result(
         runs,
         "Probability of success over severity.",
@@ -182,10 +177,9 @@ def _shares(runs: Runs, record: records.Record, cell: dict[str, Any]) -> pd.Data
     counts = levels.agg(severity=("severity", "first"), successes=("success", "sum"), trials=("success", "size"))
     rates = [statistics.clopper_pearson(k / n, n) for k, n in zip(counts["successes"], counts["trials"], strict=True)]
     ends = {end: [math.nan if cell["one_trial"] else getattr(rate, end) for rate in rates] for end in ("low", "high")}
-    counts = counts.assign(
-        axis=cell["axis"], row=cell["row"], preset=cell["preset"], share=[rate.value for rate in rates]
-    )
-    return counts.assign(**ends)[["axis", "row", "preset", *SHARE_COLUMNS]]
+    identity = {key: cell[key] for key in ("axis", "row", "preset")}
+    counts = counts.assign(**identity, share=[rate.value for rate in rates], **ends)
+    return counts[[*identity, *SHARE_COLUMNS]]
 
 
 PAGES = {"stability_axes": make_axes, "stability_cost": make_cost, "stability_curves": make_curves}

@@ -67,7 +67,6 @@ MAX_NAMED = 4  # rows in a verdict; the table has the ranks of all
 
 
 def make(*several: Runs | None) -> Result:
-    """Charts of all sets together and of each set, and a line per row."""
     runs = merge_runs(*several)
     gathered = gather(paper.SHIPPED, runs.results_dir, runs.records)
     made = Standing(gathered)
@@ -164,7 +163,6 @@ def _progress(line: dict[str, Any], budget: float) -> str:
 
 
 def _sample(made: Standing) -> str:
-    """The numbers of problems, scenes, renderers and failures at each budget, for captions."""
     parts = []
     for budget, runs in made.complete.groupby("budget"):
         problems = format.plural(len(runs.groupby(["set", "problem"])), "problem")
@@ -178,19 +176,16 @@ def _sample(made: Standing) -> str:
 
 
 def _sets_at(made: Standing, budget: float) -> list[str]:
-    """The sets with runs at a budget."""
     at_budget = {*made.complete.loc[made.complete["budget"] == budget, "set"]}
     return [name for name in made.sets if name in at_budget]
 
 
 def _when(made: Standing, budget: float) -> str:
-    """A budget as text, with its sets if they are not all sets."""
     sets = _sets_at(made, budget)
     return units(budget) + ("" if sets == made.sets else f" ({', '.join(sets)})")
 
 
 def _panel(made: Standing, of_set: str | None) -> chart.Panel:
-    """The progress of each row over its cost, in one set or in all sets: a line per budget."""
     runs = made.complete if of_set is None else made.complete[made.complete["set"] == of_set]
     groups = runs.groupby(["budget", "row"])
     lines = [
@@ -209,7 +204,6 @@ def _panel(made: Standing, of_set: str | None) -> chart.Panel:
 
 
 def _line(runs: pd.DataFrame) -> chart.Series:
-    """The mean progress of a row's runs at one budget over their cost."""
     budget = float(runs["budget"].iloc[0])
     costs = budget * np.geomspace(0.03, 1, 40)
     curves = pd.Series([np.interp(costs, *standing.progress_curve(run)) for run in runs.itertuples()], runs.index)
@@ -259,7 +253,6 @@ def _fractions(axis: Axes, panel: chart.Panel) -> None:
 
 
 def _ranks(axis: Axes, title: str, rows: Mapping[str, str], lines: Sequence[chart.Series], *, named: bool) -> None:
-    """Draws the ranks that each row can have as a bar."""
     for number, line in enumerate(lines):
         if line["name"] not in rows:
             axis.text(0.7, number, "–", color=line["colour"], va="center_baseline")
@@ -338,7 +331,6 @@ def failures(made: Standing) -> str:
 
 
 def _first_of_sets(made: Standing) -> str:
-    """The row with the most progress in each set, at each budget."""
     means, firsts = made.complete.groupby(["budget", "set", "row"])["progress"].mean(), dict[float, list[str]]()
     for (budget, name), rows in means.groupby(["budget", "set"], sort=False):
         best = rows.droplevel(["budget", "set"])

@@ -18,6 +18,7 @@ NOTES = (
     "Behind the surface: the percentage of field evaluations, coarse ones included, that are negative (DIST, Fig. 14).",
     "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene. Compare ratios, not numbers.",
 )
+WRONG = "Missed / spurious / wrong depth"
 _TIME_METRICS = ("forward_seconds", "backward_seconds", "step_seconds")
 # Metrics of the CSV at the requested size; empty if only a smaller size was finished.
 CSV_METRICS = (
@@ -29,16 +30,10 @@ CSV_METRICS = (
 
 
 def make(small: Runs | None, large: Runs | None) -> Result:
-    """A line per size and strategy: the paper's in its order, then others in the order of their runs."""
     runs = merge_runs(small, large)
     rank = {preset: number for number, preset in enumerate(published("dist_table1"))}
-    runs = replace(
-        runs,
-        records=sorted(
-            runs.records,
-            key=lambda record: (_requested(record) or 0, rank.get(records.row_of(record).preset, len(rank))),
-        ),
-    )
+    ranks = {id(record): rank.get(records.row_of(record).preset, len(rank)) for record in runs.records}
+    runs = replace(runs, records=sorted(runs.records, key=lambda run: (_requested(run) or 0, ranks[id(run)])))
     times = records.repeated(runs.records)
     return Result(
         runs,
@@ -55,7 +50,6 @@ def make(small: Runs | None, large: Runs | None) -> Result:
 
 
 def _verdict(runs: Runs) -> str:
-    """The speedup of a step by each strategy of the paper over the previous one, a sentence per size."""
     return " ".join(filter(None, (_speedups(runs, size) for size in dict.fromkeys(map(_requested, runs.records)))))
 
 
@@ -82,7 +76,6 @@ def _at_size(record: records.Record, metric: str) -> float | None:
 
 
 def _size(record: records.Record) -> str:
-    """The measured size; if it is not the requested size, also that size and the status."""
     size, requested = records.measured(record, "size"), _requested(record)
     status = "" if record["status"] == "ok" else record["status"]
     if size is not None and size == requested:
@@ -106,7 +99,6 @@ def _published(record: records.Record, column: str) -> str | None:
 
 
 def _shown(record: records.Record, column: str) -> str:
-    """A published value as text, if the row has the published size."""
     return str(_published(record, column) or "") if _published(record, "size") == str(_requested(record)) else ""
 
 
@@ -135,13 +127,8 @@ COLUMNS = (  # shown columns of a record; metrics are those of the largest finis
     table.metric("backward_seconds", "Backward", format.seconds),
     table.shown("Time of a step", _step),
     table.metric("hits", "Reference hits", table.integer),
-    table.shown(
-        "Missed / spurious / wrong depth", table.joined_cell(records.measured, table.integer, "lost", "false", "wrong")
-    ),
-    table.shown(
-        "Depth error median / max",
-        table.joined_cell(records.measured, format.number, "depth_error_median", "depth_error_max"),
-    ),
+    table.joined(WRONG, records.measured, table.integer, "lost", "false", "wrong"),
+    table.joined("Depth error median / max", records.measured, format.number, "depth_error_median", "depth_error_max"),
     table.metric("behind", "Behind the surface (%)", lambda share: format.number(share, 100)),
     table.shown("Published evaluations", lambda record: _shown(record, "queries")),
     table.shown("Published time of a step", lambda record: _shown(record, "time")),

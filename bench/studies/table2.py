@@ -30,7 +30,6 @@ BOTH_SIDES = (gallery.FRONT, gallery.BEHIND)
 
 
 def draw(compared: compare.Compared) -> Figure:
-    """Draws a panel per family: the median of each row over the number of points, and the oracle."""
     conditions, oracle, panels = compared.conditions, compared.oracles, []
     positions = range(len(conditions))
     for family in compared.families:
@@ -54,7 +53,6 @@ def _notes(compared: compare.Compared) -> tuple[str, ...]:
 
 
 def _iterations(runs: Runs) -> str:
-    """The numbers of iterations: the most frequent one, then rows with another one."""
     groups = records.grouped(runs.records, records.iterations_of)
     names = {n: list(dict.fromkeys(records.row_of(r).name for r in group)) for n, group in groups.items() if n}
     usual = max(names, key=lambda count: len(names[count]), default=None)
@@ -63,7 +61,6 @@ def _iterations(runs: Runs) -> str:
 
 
 def pictures(runs: Runs) -> Result:
-    """A block per family: the given depths over the number of points, and below them each row's shape."""
     shown = gallery.first_shapes(runs, 1, PICTURED_PRESETS)
     scenes = {name: gallery.Scene(shown, group, ARRAYS) for name, group in shown.families().items()}
     return Result(
@@ -82,7 +79,6 @@ def pictures(runs: Runs) -> Result:
 
 
 def _block(name: str, family_records: list[records.Record], scene: gallery.Scene) -> gallery.Block:
-    """The rows of a family over the number of points, with the truth in the last column."""
     by_points = records.grouped(family_records, _points)
     points = compare.ordered(by_points)
     given_depths = [scene.shared(by_points[p][:1], gallery.depth) for p in points]

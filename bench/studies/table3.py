@@ -34,7 +34,6 @@ MAX_SHAPES = 4  # per family in pictures
 
 
 def _above(compared: compare.Compared) -> compare.Above:
-    """The initial errors, by the kind of initial code, and the oracle."""
     runs, errors = compared.runs, records.CHAMFER_SCALE * compared.runs.number(START, optional=True)
     encoded = runs.setting(ENCODER_KEY) != ""
     starts = {"initial error, random": errors[~encoded], "initial error, encoder": errors[encoded]}
@@ -51,7 +50,6 @@ def _notes(compared: compare.Compared) -> list[str]:
 
 
 def pictures(runs: Runs) -> Result:
-    """A line per shape: the truth, the start, and the shape of each row."""
     shown = gallery.first_shapes(runs, MAX_SHAPES)
     names, records_by_scene = [row.name for row in shown.rows()], records.grouped(shown.records, medians.scene_of)
     scenes = {name: gallery.Scene(shown, group, gallery.SHAPES) for name, group in records_by_scene.items()}

@@ -8,11 +8,8 @@ import pandas as pd
 from bench.report.study import Result, Runs, Selection, chart, compare, statistics, table
 
 PLACE = 24
-READS = (
-    Selection(
-        "truncation", ("renderer.alpha", "renderer.step_clamp", "prior.truncation"), setup=Selection.WITHOUT_MACHINE
-    ),
-)
+KEYS = ("renderer.alpha", "renderer.step_clamp", "prior.truncation")
+READS = (Selection("truncation", KEYS, setup=Selection.WITHOUT_MACHINE),)
 SERIES = {  # (truncated prior, clamped steps): name, and the preset that gives the line style
     (True, True): ("truncated field, clamped steps: DIST's own", "dist_aggressive"),
     (True, False): ("truncated field", "dist_step_floor"),
@@ -41,7 +38,6 @@ Line = dict[str, Any]
 
 
 def make(runs: Runs) -> Result:
-    """A line per kind of field and steps, and per alpha, over all shapes."""
     runs = runs.executed
     frame = runs.frame[SHAPE].assign(
         alpha=runs.number("config.renderer.alpha"),
@@ -77,19 +73,12 @@ def _lines(frame: pd.DataFrame, kind: Kind, plain_queries: pd.Series) -> list[Li
         shapes = group.groupby(SHAPE)[["wrong", "queries"]].mean()
         shapes = shapes.assign(ratio=shapes.queries / plain_queries).dropna()
         share, ratio = (statistics.typical([np.array([x]) for x in values]) for values in (shapes.wrong, shapes.ratio))
-        identity = {
-            "field": SERIES[kind][0],
-            "preset": SERIES[kind][1],
-            "kind": kind,
-            "alpha": alpha,
-            "shapes": len(shapes),
-        }
+        identity = {"field": SERIES[kind][0], "kind": kind, "alpha": alpha, "shapes": len(shapes)}
         lines.append({**identity, "wrong": share.value, "share": share, "cost": ratio.value, "ratio": ratio})
     return lines
 
 
 def _verdict(lines: dict[tuple[Kind, float], Line]) -> str:
-    """Wrong pixels at alpha = 1.5 on distances without and with the clamp, and on a truncated field with it."""
     kinds = {"plain": DISTANCES, "clamped": (False, True), "both": (True, True)}
     if not all((kind, alpha) in lines for kind in kinds.values() for alpha in (1.0, 1.5)):
         return ""

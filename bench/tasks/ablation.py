@@ -29,16 +29,7 @@ from datasets.scene import View
 from renderers.boundary import render_checked, silhouette_loss
 from renderers.camera import Camera, Rays
 from renderers.checks import check_at_least, check_positive
-from renderers.field import (
-    Coarse,
-    Counts,
-    Field,
-    Meter,
-    Wrapper,
-    autograd_gradients,
-    autograd_normals,
-    coarse_version,
-)
+from renderers.field import Coarse, Counts, Field, Meter, Wrapper, autograd_gradients, autograd_normals, coarse_version
 from renderers.rendering import RayObservation, Renderer, Rendering, Status, check_kind
 from renderers.tracing.waits import active_mask
 
@@ -133,7 +124,6 @@ class Ablation:
             check_at_least("task.threads", self.threads, 1, "1 is steadiest")
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput without a network that was fitted to the scene's shape."""
         inputs.check_fitted()
 
     def execute(self, run: RunContext) -> None:
@@ -224,10 +214,7 @@ class Timings:
     """The costs of repeats of the same work.
 
     Args:
-        seconds: seconds of each repeat.
-        backward_seconds: seconds of each repeat's backward pass.
         cpu_seconds: seconds of all threads together.
-        counts: field evaluations of the last repeat.
         memory: largest rise of memory in a repeat, in bytes.
         flops, coarse_flops: operations of the last repeat in float32 and in bfloat16; None if the field has no count.
     """
@@ -346,7 +333,6 @@ class Workbench:
             "false": int((predicted.mask & ~reference.mask).sum()),
             "wrong": int((error > wrong).sum()),
         }
-        assert self.rendering is not None
         numbers["out_of_steps"] = int((self.rendering.status == Status.OUT_OF_STEPS).sum())
         numbers["pixel_errors"] = numbers["lost"] + numbers["false"] + numbers["wrong"]
         all_errors = torch.cat([error, torch.full((numbers["lost"] + numbers["false"],), torch.inf, dtype=error.dtype)])
@@ -391,7 +377,6 @@ class Workbench:
 
     def views(self) -> tuple[View, View]:
         """The rendered view and the reference's, on the CPU; depths in float64, normals in world axes."""
-        assert self.rendering is not None
         hit, cosine = self.rendering.hit, self.camera.double().depth(torch.ones_like(self.reference.distance))
         normals = torch.zeros_like(self.rendering.points)
         field, points = self.decoder.at(self.code.detach()), self.rendering.points[hit]

@@ -40,7 +40,6 @@ class CodeEncoder(Protocol):
         self, run: RunContext, photography: Photography, photographs: Float[Tensor, "views height width 3"]
     ) -> Float[Tensor, " code_length"]:
         """The mean code of the photographs, which `photography` took."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -126,11 +125,6 @@ class Multiview:
         """The number of starts, and the iterations of each start's trial."""
         return StartSettings(self.starts, self.trial)
 
-    @property
-    def optimises_similarity(self) -> bool:
-        """Whether a similarity transform is also optimised."""
-        return self.similarity or self.scale != 1 or self.degrees > 0 or self.shift > 0
-
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput without a prior."""
         inputs.check_prior()
@@ -175,7 +169,13 @@ class Multiview:
             raise BadInput("a prior of one shape has no spread from which to draw codes: set prior.shapes=96")
         code_std = self.start_scale * prior.codes.std(0)
         codes = code_std * torch.randn(self.starts, prior.decoder.code_length, generator=generator)
-        misplaced = self._initial_similarity(generator) if self.optimises_similarity else None
+        similarities = None
+        if self.similarity or self.scale != 1 or self.degrees > 0 or self.shift > 0:
+            axis, direction = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=1)
+            numbers = [self.shift * direction, radians(self.degrees) * axis, torch.tensor([self.scale]).log()]
+            similarities = torch.cat(numbers).expand(self.starts, -1)
+        if photometric_loss.from_user and self.similarity:
+            similarities = initial_rotations(self.starts)
         observed = torch.zeros(photometric_loss.colours.shape[1:3], dtype=torch.bool, device="cpu")
         last = self.optimiser.iterations  # when images are no longer blurred
         return CodeProblem(
@@ -186,20 +186,12 @@ class Multiview:
             (photometric_loss.rays_per_pixel + 1) * photometric_loss.per_step,
             photometric_loss.colours.device,
             initial=codes,
-            initial_similarities=initial_rotations(self.starts)
-            if photometric_loss.from_user and self.similarity
-            else misplaced,
+            initial_similarities=similarities,
             trial=self.trial,
             photographs=photometric_loss.colours.cpu().numpy(),
             progress_measure=lambda field: float(total(photometric_loss.compare_at(field, last))),
             draw=photometric_loss.draw,
         )
-
-    def _initial_similarity(self, generator: torch.Generator) -> Float[Tensor, "starts 7"]:
-        """A similarity transform of the set magnitude in random directions, the same for all starts."""
-        axis, direction = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=1)
-        similarity = torch.cat([self.shift * direction, radians(self.degrees) * axis, torch.tensor([self.scale]).log()])
-        return similarity.expand(self.starts, -1)
 
 
 class PhotometricLoss:
@@ -328,22 +320,13 @@ class PhotometricLoss:
             distance = torch.zeros_like(needed, dtype=neighbour.distance.dtype)
             distance = distance.masked_scatter(needed, neighbour.distance)
             hit = needed.clone().masked_scatter(needed, neighbour.hit)
-        depths = [self.cameras[other].depth(distance[k]) for k, other in enumerate(neighbours)]
-        agree = [self._sees(depths[k], hit[k], *projected[k]) for k in range(len(neighbours))]
+        agree = []
+        for k, (pixels, expected) in enumerate(projected):  # the neighbour's depth agrees with that of the point (B.3)
+            depth = self.cameras[neighbours[k]].depth(distance[k])
+            interpolated, inside = sample(torch.stack([depth * hit[k], hit[k].to(depth.dtype)], dim=-1), pixels)
+            close = (interpolated[..., 0] - expected).square() < self.settings.visible
+            agree.append(inside & close & (interpolated[..., 1] > MIN_INTERPOLATION_WEIGHT))
         return rendering.hit & torch.stack(agree)
-
-    def _sees(
-        self,
-        depth: Float[Tensor, "height width"],
-        hit: Bool[Tensor, "height width"],
-        pixels: Float[Tensor, "*points 2"],
-        expected: Float[Tensor, "*points"],
-    ) -> Bool[Tensor, "*points"]:
-        """Whether a view's depth agrees with `expected`, of another view's points at `pixels` (DIST, B.3)."""
-        depth_and_weight = torch.stack([depth * hit, hit.to(depth.dtype)], dim=-1)
-        interpolated, inside = sample(depth_and_weight, pixels)
-        close = (interpolated[..., 0] - expected).square() < self.settings.visible
-        return inside & close & (interpolated[..., 1] > MIN_INTERPOLATION_WEIGHT)
 
     def _stack_rays(self, views: list[int]) -> Rays:
         return stacked([self.rays[view] for view in views])

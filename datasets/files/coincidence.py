@@ -43,7 +43,6 @@ class Change:
     shift: Float[np.ndarray, "3"]
 
     def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """The changed points."""
         return self.factor * points @ self.turn.T + self.shift
 
     def undo(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -151,7 +150,6 @@ class Comparison:
         return self.misfit <= self.measure.limit and not self.is_other_frame
 
     def text(self, thing: str, reference: str) -> str:
-        """The misfit of `thing` and `reference`, and the change, in words."""
         misfit = self.measure.text.format(thing=thing, reference=reference, misfit=self.misfit, overlap=1 - self.misfit)
         if self.change is IDENTITY:
             return misfit
@@ -179,7 +177,6 @@ def settled(
 
 
 def samples_of(mesh: Mesh) -> Float[np.ndarray, "n 3"]:
-    """Points on a mesh for comparisons."""
     return sample_surface(mesh, SAMPLES[0], seed=0).points
 
 
@@ -203,7 +200,9 @@ def compare_surfaces(
 
         def misfit(change: Change) -> float:
             if change is IDENTITY and is_partial and isinstance(shape, Mesh):
-                distances = [_exact_distances(shape, reference[:queries], centre, radius)]
+                # float32 suffices in the frame of the reference
+                truth = Truth(replace(shape, vertices=(shape.vertices - centre) / radius), closed=False)
+                distances = [radius * truth.distance((reference[:queries] - centre) / radius)]
             else:
                 inverse = change.undo(reference[:queries])
                 distances = [change.factor * tree.query(inverse, distance_upper_bound=limit / change.factor)[0]]
@@ -215,14 +214,6 @@ def compare_surfaces(
         return misfit
 
     return _compare(DISTANCE, sampled(*SAMPLES, inf), sampled(*FAST_SAMPLES, radius), points, reference)
-
-
-def _exact_distances(
-    mesh: Mesh, points: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, "3"], radius: float
-) -> Float[np.ndarray, " n"]:
-    """Distances of points to a mesh; `centre` and `radius` are of a frame in which float32 suffices."""
-    truth = Truth(replace(mesh, vertices=(mesh.vertices - centre) / radius), closed=False)
-    return radius * truth.distance((points - centre) / radius)
 
 
 def points_in_sphere(points: Float[np.ndarray, "n 3"], to_world: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "m 3"]:
@@ -274,7 +265,6 @@ def compare_outlines(
 
 def _small_view(shot: Shot, side: int) -> tuple[Float[np.ndarray, "3 4"], Bool[np.ndarray, "h w"]]:
     """The projection of a photograph and its mask, with `side` pixels along the longer side."""
-    assert shot.mask is not None
     height, width = (max(1, round(length * side / max(shot.mask.shape))) for length in shot.mask.shape)
     camera = shot.camera.resized(height, width)
     mask = torch.nn.functional.interpolate(shot.mask[None, None].double(), (height, width), mode="area")[0, 0] > 0

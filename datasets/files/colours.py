@@ -12,7 +12,7 @@ from PIL import Image
 from datasets.extras import material_files, referenced_files
 from datasets.files.meshes import read_surface
 from datasets.files.readers.glb import UNCOLOURED_GREY
-from datasets.files.readers.polygons import Material, Polygons
+from datasets.files.readers.polygons import Material
 from datasets.files.readers.text import read_mtl
 from datasets.mesh import Mesh
 from datasets.scene import Truth
@@ -33,7 +33,6 @@ class FileColours:
     """A `Texture`: a point has the colour of the nearest point of the file's unrepaired surface.
 
     Args:
-        path: of the file.
         rest: its repaired mesh.
         shape: the same faces, in the frame of the points.
 
@@ -48,7 +47,6 @@ class FileColours:
 
     @property
     def texels(self) -> int:
-        """The number of pixels of the file's images."""
         return sum(image.width * image.height for image in self._paint.images)
 
     def __call__(self, points: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> np.ndarray:
@@ -73,7 +71,9 @@ def _read_paint(path: Path, changed: int) -> Paint:
     if missing := [file for file in referenced_files(path) if not file.is_file()]:
         raise BadInput(f"mesh file '{path}' names '{missing[0].name}', which is not there: put it at '{missing[0]}'")
     cuts, polygon = polygons.cuts
-    materials = [*_materials(path, polygons), Material()]  # the last, at -1, is for polygons without a material
+    library = {name: material for file in material_files(path) for name, material in read_mtl(file).items()}
+    materials = [library.get(material.name, material) for material in polygons.materials]
+    materials.append(Material())  # at -1, for polygons without a material
     index = np.full(len(cuts), -1) if polygons.material is None else polygons.material[polygon]
     coordinates = np.full((*cuts.shape, 2), np.nan) if polygons.coordinates is None else polygons.coordinates[cuts]
     images = list(dict.fromkeys(material.image for material in materials if material.image is not None))
@@ -92,12 +92,6 @@ def _read_paint(path: Path, changed: int) -> Paint:
         np.repeat(image, 3),
         [_open_texture(path, image) for image in images],
     )
-
-
-def _materials(path: Path, polygons: Polygons) -> list[Material]:
-    """The materials of the polygons; materials with only a name are read from .mtl files."""
-    library = {name: material for file in material_files(path) for name, material in read_mtl(file).items()}
-    return [library.get(material.name, material) for material in polygons.materials]
 
 
 def _open_texture(path: Path, image: bytes | Path) -> Any:

@@ -38,16 +38,10 @@ class Deformation:
             raise ValueError(f"strength: must be from 0 to 1, found {strength}; 1 is the strongest that cannot fold")
         generator = np.random.default_rng(seed)
         amounts = strength * generator.uniform(-1, 1, 6)
-        axes = generator.integers(0, 3, 3)
-        return cls(
-            stretch=tuple(float(amount) for amount in MAX_LOG_SCALE * amounts[:3]),
-            taper=float(MAX_TAPER * amounts[3]),
-            taper_axis=int(axes[0]),
-            twist=float(MAX_TWIST_RADIANS * amounts[4]),
-            twist_axis=int(axes[1]),
-            bend=float(MAX_CURVATURE * amounts[5]),
-            bend_axis=int(axes[2]),
-        )
+        axes = generator.integers(0, 3, 3).tolist()
+        stretch = tuple((MAX_LOG_SCALE * amounts[:3]).tolist())
+        taper, twist, bend = (np.array([MAX_TAPER, MAX_TWIST_RADIANS, MAX_CURVATURE]) * amounts[3:]).tolist()
+        return cls(stretch, taper, axes[0], twist, axes[1], bend, axes[2])
 
     def apply(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Moves points of the unit sphere; the result is not normalised again."""

@@ -26,9 +26,10 @@ def first_of_each_shape(files: Sequence[Path], cache: Path) -> dict[Path, Path]:
     Args:
         cache: a folder that keeps `shape_numbers` and comparisons by the files' contents, since each run asks for them.
     """
-    keys = {file: _key(file) for file in files}
-    numbers = dict[Path, np.ndarray]()
+    keys, numbers = dict[Path, str](), dict[Path, np.ndarray]()
     for file in files:
+        content = readers_code(), file.suffix.lower().encode(), file.read_bytes()
+        keys[file] = hashlib.sha256(b"\0".join(content)).hexdigest()[:16]
         with suppress(ValueError):
             numbers[file] = _cached(cache / keys[file], lambda file=file: shape_numbers(read_mesh(file)))
     readable, first_files = [*numbers], {file: file for file in files}
@@ -89,21 +90,20 @@ def readers_code() -> bytes:
     return b"\0".join(file.read_bytes() for file in sorted(Path(__file__).parent.rglob("*.py")))
 
 
-def _key(file: Path) -> str:
-    """The same for files with the same content and format."""
-    content = readers_code(), file.suffix.lower().encode(), file.read_bytes()
-    return hashlib.sha256(b"\0".join(content)).hexdigest()[:16]
-
-
 def _cached(path: Path, compute: Callable[[], np.ndarray]) -> np.ndarray:
     """The array at a path of the cache without its suffix, computed if it is not there."""
     entry = path.with_name(f"{path.name}.npy")
     with suppress(OSError, EOFError, ValueError):
         return np.load(entry)
     array = compute()
-    with suppress(OSError):  # a cache that cannot be written to
+    write_cached(entry, lambda scratch: np.save(scratch, array))
+    return array
+
+
+def write_cached(entry: Path, write: Callable[[Path], None]) -> None:
+    """Writes a file of the cache atomically, since another process may do the same; none if that is not possible."""
+    with suppress(OSError):
         entry.parent.mkdir(parents=True, exist_ok=True)
         scratch = entry.with_name(f"{os.getpid()}.{entry.name}")
-        np.save(scratch, array)
+        write(scratch)
         scratch.replace(entry)
-    return array

@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import tempfile
 import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ import numpy as np
 from datasets.extras import referenced_files, version
 from datasets.files.colours import FileColours
 from datasets.files.deform import Deformation
-from datasets.files.duplicates import first_of_each_shape, readers_code
+from datasets.files.duplicates import first_of_each_shape, readers_code, write_cached
 from datasets.files.meshes import find_meshes, load_mesh
 from datasets.mesh import Mesh, normalise
 from datasets.scene import Split, seed_of
@@ -55,7 +54,6 @@ class LocalMeshes:
 
     @property
     def name(self) -> str:
-        """The file's or the folder's name, without suffix."""
         return Path(self.path).resolve().stem
 
     def mesh(self, split: Split, index: int) -> Mesh:
@@ -70,7 +68,6 @@ class LocalMeshes:
         return normalise(replace(mesh, vertices=deformation.apply(mesh.vertices)), self.radius)
 
     def texture(self, split: Split, index: int) -> Texture:
-        """The colours that the file gives a shape; see `Textured`."""
         file = self._file(split, index)
         return FileColours(file, load_repaired(file), self.mesh(split, index))
 
@@ -136,17 +133,12 @@ def load_repaired(path: Path) -> Mesh:
     The cache key covers this code, PyMeshLab's version and the file: if one changes, the mesh is repaired again.
     """
     fingerprint = b"\0".join([str(version("pymeshlab")).encode(), readers_code(), path.read_bytes()])
-    folder = cache_folder("meshes")
-    entry = folder / f"{hashlib.sha256(fingerprint).hexdigest()[:16]}.npz"
+    entry = cache_folder("meshes") / f"{hashlib.sha256(fingerprint).hexdigest()[:16]}.npz"
     with suppress(OSError, EOFError, ValueError, KeyError, BadZipFile), entry.open("rb") as file, np.load(file) as data:
         return Mesh(data["vertices"], data["faces"], tuple(map(str, data["repairs"])))
     started = time.perf_counter()
     mesh = load_mesh(path)
     if time.perf_counter() - started > MIN_CACHED_SECONDS:
-        with suppress(OSError):  # a cache that cannot be written to
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=folder) as scratch:  # another process may do the same
-                written = Path(scratch, entry.name)
-                np.savez(written, vertices=mesh.vertices, faces=mesh.faces, repairs=mesh.repairs)
-                written.replace(entry)
+        arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "repairs": mesh.repairs}
+        write_cached(entry, lambda scratch: np.savez(scratch, **arrays))
     return mesh

@@ -97,7 +97,6 @@ def read_pieces(path: str | Path) -> Mesh:
 
 
 def concatenate_meshes(meshes: Sequence[Mesh]) -> Mesh:
-    """Concatenates meshes into one, without colours."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=False)]
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))

@@ -102,7 +102,6 @@ class NetworkFile:
 
     @property
     def name(self) -> str:
-        """The file's or the folder's name, without suffix."""
         return Path(self.path).resolve().stem
 
     def mesh(self, split: Split, index: int) -> Mesh:
@@ -124,7 +123,6 @@ class NetworkFile:
 
     @property
     def files(self) -> list[Path]:
-        """The files that are read."""
         path = Path(self.path)
         names = ("specs.json", FIELD_FILE, *DEEPSDF_FILES) if path.is_dir() else ("",)
         return [file for file in (*(path / name for name in names), Path(self.codes or "")) if file.is_file()]
@@ -256,7 +254,6 @@ def _read(file: NetworkFile) -> tuple[Published, Tensor]:
 
 
 def _read_folder(path: Path, squash: int | None) -> Published:
-    """The network of a DeepSDF folder."""
     try:
         specs = json.loads((path / "specs.json").read_text("utf-8"))
     except OSError:
@@ -283,6 +280,5 @@ def _by_tensor_names(tensors: dict[str, Tensor]) -> Published:
 
 
 def _content_hash(files: list[Path]) -> str:
-    """A hash of the names and contents of files."""
     hashes = (file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest() for file in files)
     return hashlib.sha256(b"".join(hashes)).hexdigest()

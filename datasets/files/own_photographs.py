@@ -33,8 +33,6 @@ class Capture:
     """Photographs of one object, which lies in the unit sphere.
 
     Args:
-        format: of the folder.
-        shots: the photographs, by name.
         masks: the source of the masks, in words; empty without masks.
         sphere_source: how the unit sphere was found, in words.
         to_world: the similarity from the world of the unit sphere to the file's world.
@@ -52,7 +50,6 @@ class Capture:
 
     @property
     def sphere(self) -> Sphere:
-        """The unit sphere in the file's world."""
         return Sphere(self.to_world[:3, 3], float(np.linalg.norm(self.to_world[:3, 0])), self.sphere_source)
 
     @property
@@ -113,11 +110,9 @@ class OwnPhotographs:
 
     @property
     def name(self) -> str:
-        """The folder's name."""
         return Path(self.path).resolve().name
 
     def capture(self, longest: int, held_out: int) -> Capture:
-        """See `Photographed`."""
         settings = ReadSettings(longest, self.masks, self.axes, held_out, self.images, self.unchecked)
         return read_capture(Path(self.path), settings)
 

@@ -52,8 +52,11 @@ def repair(mesh: Mesh, close: Callable[[Mesh], Mesh | None] | None = None) -> Me
     solid = _merge(_turn_outward(closed))
     if solid is None:
         return _warned(mesh, _wrap(closed, "its overlapping parts could not be merged into a solid"))
-    if solid.repairs != mesh.repairs and not _covers(solid, mesh):
-        return _warned(mesh, _wrap(mesh, "closing its holes and merging its parts would cut away some of its surface"))
+    if solid.repairs != mesh.repairs:
+        distances = Truth(solid).signed_distance(sample_surface(mesh, 5000, seed=0).points)
+        if (distances > OUTSIDE_DISTANCE * mesh.diagonal).mean() > MAX_OUTSIDE_FRACTION:
+            reason = "closing its holes and merging its parts would cut away some of its surface"
+            return _warned(mesh, _wrap(mesh, reason))
     return _warned(mesh, solid, closed)
 
 
@@ -207,13 +210,6 @@ def _united(mesh: Mesh) -> Mesh:
     return with_note(merged, f"{len(solids)} overlapping parts merged into {merged.parts.max() + 1}")
 
 
-def _covers(solid: Mesh, mesh: Mesh) -> bool:
-    """True if at most `MAX_OUTSIDE_FRACTION` of the mesh's surface lies outside the solid."""
-    points = sample_surface(mesh, 5000, seed=0).points
-    outside = Truth(solid).signed_distance(points) > OUTSIDE_DISTANCE * mesh.diagonal
-    return bool(outside.mean() <= MAX_OUTSIDE_FRACTION)
-
-
 def _wrap(mesh: Mesh, reason: str) -> Mesh:
     """Shrinks a closed surface around the mesh, as fine as possible without entering its inside."""
     lab = require_meshlab(f"the mesh must be wrapped, since {reason}, which")
@@ -355,7 +351,6 @@ def _by_open3d(mesh: Mesh, name: str) -> Mesh:
 
 
 def with_note(mesh: Mesh, repair: str) -> Mesh:
-    """The mesh with one more note in `repairs`."""
     return replace(mesh, repairs=(*mesh.repairs, repair))
 
 

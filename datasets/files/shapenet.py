@@ -68,7 +68,6 @@ class ShapeNet:
 
     @property
     def folder(self) -> Path:
-        """The folder of the class."""
         return Path(self.path) / SYNSETS.get(self.synset, self.synset.zfill(8))
 
     def mesh(self, split: Split, index: int) -> Mesh:
@@ -77,8 +76,7 @@ class ShapeNet:
         mesh, notes = _load(file, self.normalised), [f"the shape is {_id(file)}"]
         if missing := {*self.lists.get(split, ())}.difference(map(_id, self.files[split])):
             count = _counted(len(missing), "shape of the list is", "shapes of the list are")
-            text = f"{count} not on disk, and left out, such as {min(missing)}"
-            notes.append(f"warning: {text}")
+            notes.append(f"warning: {count} not on disk, and left out, such as {min(missing)}")
         return replace(mesh, repairs=(*notes, *self._counts, *mesh.repairs))
 
     @property
@@ -95,7 +93,6 @@ class ShapeNet:
             yield f"{_counted(len(on_disk) - first, 'shape is', 'shapes are')} of ShapeNetCore v2, and {first} of v1"
 
     def texture(self, split: Split, index: int) -> Texture:
-        """The colours of a shape from its file; see `Textured`."""
         file = self._file(split, index)
         return FileColours(file, load_repaired(file), self.mesh(split, index))
 
@@ -143,7 +140,6 @@ class ShapeNet:
 
     @cached_property
     def lists(self) -> dict[Split, list[str]]:
-        """The ids that each list names."""
         return {} if self.split is None else read_lists(Path(self.split), self.folder.name, _shapes(self.folder))
 
     def identity(self) -> dict[str, Any]:
@@ -159,7 +155,6 @@ def _counted(count: int, singular: str, plural: str) -> str:
 
 
 def _id(file: Path) -> str:
-    """The id of a shape, the name of its folder."""
     return file.parts[-3 if file.parent.name == "models" else -2]
 
 

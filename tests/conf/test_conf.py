@@ -319,9 +319,7 @@ def test_a_user_renderer_needs_only_its_class(compose_config, tmp_path, monkeypa
         build_part(compose_config("renderer=custom", "renderer._target_=mypkg_of_mine.Yours"), "renderer")
     with pytest.raises(ValueError, match="No module named 'no_such_package'; add its folder to PYTHONPATH"):
         load("renderer", "custom", _target_="no_such_package.Mine")
-    with pytest.raises(
-        ValueError, match=r"size and renderer\.more must be given: set \+renderer\.size=\.\.\. \+renderer\.more"
-    ):
+    with pytest.raises(ValueError, match=r"size and renderer\.more must be .*: set \+renderer\.size=.* \+renderer\."):
         load("renderer", "custom", _target_="mypkg_of_mine.TwoSettings")
     with pytest.raises(ValueError, match="it does not define render: see renderers"):
         load("renderer", "custom", _target_="mypkg_of_mine.Abstract")

@@ -61,9 +61,8 @@ def test_noise_stays_in_the_depths_and_is_noted(tmp_path):
     scene = make_scene(scans(write_scans(tmp_path, noise=0.002)), PARALLEL_VIEWS, split=Split.TEST, index=0)
     _, both = scene.observed_view(exact=True)
     off = (scene.measured - scene.view.depth)[both].abs()
-    assert (
-        0.4 < float(off.median()) / (0.6745 * 0.002 * 0.97 / RADIUS) < 1.3
-    )  # half of a Gaussian is within 0.6745 standard deviations
+    deviation = 0.6745 * 0.002 * 0.97 / RADIUS  # half of a Gaussian is within 0.6745 standard deviations
+    assert 0.4 < float(off.median()) / deviation < 1.3
     (note,) = scene.measured_depth_notes
     assert note.startswith(f"measured: {int(both.sum())} of the shape's {int(scene.view.mask.sum())} pixels")
     half, most = off.quantile(torch.tensor([0.5, 0.95])).tolist()

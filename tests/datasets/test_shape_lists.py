@@ -143,9 +143,8 @@ def test_a_row_without_a_split_in_its_column_is_refused(tmp_path, line):
 
 def test_no_shape_is_lost_or_in_two_splits_and_the_counts_are_noted(tmp_path):
     write_shape(tmp_path, CAR, IDS[0])
-    assert (
-        "1 shape on disk, 1 used: 0 train, 0 validation, 1 test" in shapenet(tmp_path, None).mesh(Split.TEST, 0).repairs
-    )
+    notes = shapenet(tmp_path, None).mesh(Split.TEST, 0).repairs
+    assert "1 shape on disk, 1 used: 0 train, 0 validation, 1 test" in notes
     write_shape(tmp_path, CAR, IDS[6], version=1)
     notes = shapenet(tmp_path, None).mesh(Split.TEST, 0).repairs
     assert "1 shape is of ShapeNetCore v2, and 1 of v1" in notes

@@ -28,7 +28,6 @@ def test_a_command_fits_shape_and_colour_to_one_image(tmp_path):
             assert hit.shape == (size, size) and not arrays[f"{kind}{side}_colours"][hit == 0].any()
             assert kind != "true_" or 0.05 < hit.mean() < 0.9
     small, large = arrays["true_size_1_colours"], arrays["true_size_2_colours"]
-    assert (
-        np.abs(large.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3)) - small).mean() < 0.1
-    )  # both images are of the same camera
+    # Both images are of the same camera.
+    assert np.abs(large.reshape(8, 4, 8, 4, 3).mean(axis=(1, 3)) - small).mean() < 0.1
     assert np.abs(arrays["true_turned_0_colours"] - large).mean() > 0.03

@@ -149,9 +149,7 @@ def test_observed_distances_reach_only_a_renderer_that_takes_them():
     assert silhouette_loss(Mine(), field, RAYS, rendering, observation) == IDR.silhouette_loss(
         field, RAYS, rendering, MASK
     )
-    with pytest.raises(
-        BrokenContract, match=r"TakesDistances\.observed_loss must return a tensor with one number, not None"
-    ):
+    with pytest.raises(BrokenContract, match=r"TakesDistances\.observed_loss must return a tensor .*, not None"):
         silhouette_loss(TakesDistances(loss=lambda loss: None), field, RAYS, rendering, observation)
 
 

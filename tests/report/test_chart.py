@@ -109,9 +109,7 @@ def test_what_is_infinite_is_above_all_that_its_axis_shows(shared, edge):
 def test_a_verdict_has_the_best_and_the_worst_row_and_none_where_nothing_is_finite():
     values = {"a": 2.0, "b": math.inf, "c": 1.0, "d": None, "e": math.nan}
     assert extremes("Error", values, "3 shapes") == "Error: *1.00* (c) to ∞ (b); n = 3 shapes."
-    assert (
-        extremes("Score", {"a": 2.0, "c": 1.0}, "3 shapes", largest_first=True)
-        == "Score: *2.00* (a) to 1.00 (c); n = 3 shapes."
-    )
+    largest = extremes("Score", {"a": 2.0, "c": 1.0}, "3 shapes", largest_first=True)
+    assert largest == "Score: *2.00* (a) to 1.00 (c); n = 3 shapes."
     assert extremes("Error", {"a": 2.0}, "1 shape") == "Error: *2.00* (a); n = 1 shape."
     assert extremes("Error", {"b": math.inf}, "3 shapes") == extremes("Error", {}, "3 shapes") == ""

@@ -24,18 +24,14 @@ def test_a_comparison_agrees_with_its_reverse_and_with_the_table_of_the_suite(tm
     assert list(table["significant"]) == [False, True] and {*table["scenes"]} == {24}
     reverse = bench.compare(["dvr_64_early_stop", "newton"], tmp_path).loc["Newton"]
     same = table.loc["DVR, n = 64, early stop"]
-    assert (
-        reverse["difference"] == pytest.approx(-same["difference"])
-        and reverse["p_uncorrected"] == same["p_uncorrected"]
-    )
+    assert reverse["difference"] == pytest.approx(-same["difference"])
+    assert reverse["p_uncorrected"] == same["p_uncorrected"]
     assert reverse["low"] == pytest.approx(-same["high"], abs=1e-6)
 
 
 @pytest.mark.usefixtures("shipped")
 def test_a_renderer_without_runs_is_named_with_the_command_that_makes_them(tmp_path):
-    with pytest.raises(
-        ValueError, match=r"of 'newtn' on the suite at 1 unit: did you mean newton\?; complete are DIST"
-    ):
+    with pytest.raises(ValueError, match=r"'newtn' .* at 1 unit: did you mean newton\?; complete are DIST"):
         bench.compare(["dist", "newtn"], tmp_path)
     with pytest.raises(ValueError, match="two renderers or more"):
         bench.compare("newton")

@@ -71,10 +71,7 @@ def test_another_setting_of_the_shared_parts_is_told(tmp_path):
     write_run(
         tmp_path, "table2", OTHER, task="completion", dataset="sofa", settings={"view": {"resolution": 8}}, minute=0
     )
-    assert (
-        "Runs differ in view.resolution: do not compare rows with different values."
-        in page_of(tmp_path, "table2").notes
-    )
+    assert "Runs differ in view.resolution: do not compare rows " in told(page_of(tmp_path, "table2"))
 
 
 @pytest.mark.parametrize("odd", [{"renderer": {"epsilon": 1.0}}, {"silhouette": {"weight": 9}}, {"task": {"code": 1}}])

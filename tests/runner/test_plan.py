@@ -76,13 +76,8 @@ def test_finished_runs_are_reused_and_give_the_times_of_similar_runs(results):
     *lines, summary = command(*SWEEP, "plan=true", f"results_dir={results}").out.splitlines()
     times = ["reused", "about 30.0 s (median of 1 finished run)", *["time unknown"] * 2]
     assert [line.split("  ")[-1] for line in lines] == times
-    assert summary.startswith(
-        "4 planned: 3 to run, 1 reused, 2 of unknown time (no similar run has finished here, and none is shipped);"
-    )
-    assert (
-        "; about 30.0 s by mean times, 1 at a time, without the 2 of unknown time; the training of a missing prior is "
-        in summary
-    )
+    assert summary.startswith("4 planned: 3 to run, 1 reused, 2 of unknown time (")
+    assert "; about 30.0 s by mean times, 1 at a time, without the 2 of unknown time; the training of" in summary
     assert sorted(results.rglob("*")) == before
     again = command(*SWEEP, "plan=true", "rerun=all", "hydra/launcher=workers", f"results_dir={results}").out
     assert "; about 30.0 s by mean times, 2 at a time, without" in again.splitlines()[-1]

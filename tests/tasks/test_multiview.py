@@ -278,9 +278,8 @@ def test_photographs_of_ones_own_are_set_upright_about_their_hull_and_a_prior_is
     idr(tmp_path)
     overrides = ("task=multiview", "dataset=photos", f"dataset.path={tmp_path}", "scale=smoke", "threads=1")
     message = command(*overrides, f"results_dir={tmp_path}").err
-    assert (
-        "set prior.of=sofa" in message and "none with task=reconstruction" in message and "depth image" not in message
-    )
+    assert "set prior.of=sofa" in message and "none with task=reconstruction" in message
+    assert "depth image" not in message
     encoded = command(*overrides, "+method=multiview_encoder", "prior.of=car", f"results_dir={tmp_path}")
     assert "take +method=multiview_dist" in encoded.err
     small = ("task.longest=24", "task.rotations=2", "task.optimiser.iterations=40", "evaluation.grid=24")

@@ -51,9 +51,8 @@ def test_a_surface_has_colours_metrics_and_pictures_and_no_evaluations(scene, tm
     assert record.evaluations == {"value": 0, "gradient": 0}
     assert record.seconds["forward"] > 0 and record.seconds["backward"] == 0 and record.seconds["evaluation"] > 0
     chamfer, overlap, psnr = WORST[name]
-    assert (
-        metrics[SEEN_PREFIX + "chamfer_l1"] < chamfer and metrics["mask_iou"] > overlap and metrics["psnr_image"] > psnr
-    )
+    assert metrics[SEEN_PREFIX + "chamfer_l1"] < chamfer
+    assert metrics["mask_iou"] > overlap and metrics["psnr_image"] > psnr
     assert assert_coloured_mesh(tmp_path).std(axis=0).max() > 5
     count, size = task.images.views, task.longest
     summary = (

@@ -32,13 +32,10 @@ def read(folder: Path, columns: Sequence[str] = COLUMNS) -> tuple[pd.DataFrame, 
 
 
 def median(runs: list[pd.DataFrame], failed: list[bool], quantity: str) -> pd.DataFrame:
-    """The median, minimum and maximum of a quantity over the runs of a row, and the median of the seconds.
+    """Columns iteration, seconds, median, low, high: of a quantity over the runs of a row, and the median seconds.
 
     After its end, a failed run counts as infinite, so that failures do not improve a row. Iterations at which another
     run has no value are left out.
-
-    Returns:
-        Columns iteration, seconds, median, low, high.
     """
     numbered = [run.set_index("iteration") for run in runs]
     values = pd.concat([run[quantity] for run in numbered], axis=1, keys=range(len(runs))).sort_index()

@@ -12,10 +12,7 @@ MAX_EXACT_UNITS = 16  # up to here all sign vectors are tested, above it 2**15 r
 
 @cache
 def signs(units: int) -> np.ndarray:
-    """The sign vectors [flips, units]; all units of the first flip are positive.
-
-    Of all sign vectors, those with a positive first unit: the others give the same sums with the opposite sign.
-    """
+    """The sign vectors [flips, units] whose first sign is positive: the others give the same sums, negated."""
     if units <= MAX_EXACT_UNITS:
         return np.array([(1.0, *others)[:units] for others in product((1.0, -1.0), repeat=max(units - 1, 0))])
     random_signs = np.random.default_rng(0).choice((1.0, -1.0), (2 ** (MAX_EXACT_UNITS - 1), units))
@@ -41,10 +38,7 @@ def any_at_most(differences: np.ndarray, p_value: float) -> bool:
 
 
 def bounds(values: np.ndarray, alpha: float) -> tuple[float, float] | None:
-    """The smallest and largest end of simultaneous confidence intervals of the means of values [units, columns].
-
-    Their joint level is 1 - alpha. None without columns, or with too few units to reject any mean.
-    """
+    """The ends of simultaneous intervals, at 1 - alpha, of the means of values [units, columns]; None if few."""
     units, columns = values.shape
     if not columns or units < shapes_needed(columns, alpha):
         return None

@@ -72,19 +72,10 @@ def load(results_dir: str | os.PathLike[str] = RESULTS, *, config: bool = False)
 
 def to_frame(records: Iterable[dict[str, Any]]) -> pd.DataFrame:
     """A row per run, with the columns that `load` states and all settings; without sweeps."""
-    columns = _columns(list(records))
+    rows = [_row(record) for record in records]
+    names = sorted({name for row in rows for name in row}, key=_sort_key)
+    columns = {name: [row.get(name) for row in rows] for name in dict.fromkeys((*FIXED_COLUMNS, *names))}
     return pd.DataFrame({name: _series(values, _type(name, values)) for name, values in columns.items()})
-
-
-def _columns(records: list[dict[str, Any]]) -> dict[str, list[Any]]:
-    """The values of each column; None if a run has no value."""
-    columns: dict[str, list[Any]] = {name: [None] * len(records) for name in FIXED_COLUMNS}
-    for row, record in enumerate(records):
-        for name, value in _row(record).items():
-            if name not in columns:
-                columns[name] = [None] * len(records)
-            columns[name][row] = value
-    return {name: columns[name] for name in dict.fromkeys((*FIXED_COLUMNS, *sorted(columns, key=_sort_key)))}
 
 
 def _row(record: dict[str, Any]) -> dict[str, Any]:
@@ -102,10 +93,7 @@ def _row(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _series(values: list[Any], kind: str) -> pd.Series:
-    """A column of that type; categories are text, also if the column is empty.
-
-    If a foreign record has values of another type, the column becomes text.
-    """
+    """A column of that type; text if a foreign record has values of another type. Categories are text."""
     if kind != CATEGORY:
         try:
             return pd.Series(values, dtype=kind)
@@ -117,7 +105,6 @@ def _series(values: list[Any], kind: str) -> pd.Series:
 
 
 def _cell(value: Any) -> Any:
-    """A value that fits into a cell: a list becomes text."""
     return value if isinstance(value, str | int | float | None) else str(value)
 
 

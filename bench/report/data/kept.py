@@ -42,11 +42,7 @@ def write_rows(records: Iterable[Record], experiments: Iterable[str], folder: Pa
 
 
 def read_rows(folder: Path, experiment: str = "[!.]*") -> list[Record]:
-    """Reads the records of all such files of a folder, or of those whose experiment has the pattern.
-
-    Raises:
-        ValueError: a file cannot be read.
-    """
+    """Reads the records of such files, of the experiments of that pattern; raises ValueError for a damaged file."""
     records = list[Record]()
     for path in sorted(folder.glob(f"{experiment}{SUFFIX}")):
         try:
@@ -103,7 +99,6 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _node(nodes: dict[str, Any], name: str) -> dict[str, Any]:
-    """The node of that name, made where it is missing."""
     if name not in nodes:
         parent, _, key = name.rpartition(".")
         nodes[name] = _node(nodes, parent).setdefault(key, {})

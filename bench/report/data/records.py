@@ -22,16 +22,10 @@ Item, Key = TypeVar("Item"), TypeVar("Key", bound=Hashable)
 
 @dataclass(frozen=True)
 class Row:
-    """The row of a table to which a run belongs: a preset, which decides colours and published numbers, and a name.
+    """The row of a table to which a run belongs."""
 
-    Args:
-        preset: the chosen method, or else the renderer.
-        name: the run's label, else the renderer's label, else the renderer's file. It includes the silhouette loss if
-            the rows of an experiment differ in it.
-    """
-
-    preset: str
-    name: str
+    preset: str  # the method, or else the renderer; it decides colours and published numbers
+    name: str  # its label, or that of the renderer; with the silhouette loss if the rows of an experiment differ in it
 
 
 def row_of(record: Record) -> Row:
@@ -81,7 +75,6 @@ def error(record: Record, name: str) -> float:
 
 
 def loop_seconds(record: Record) -> float | None:
-    """The seconds of the optimisation loop, or None."""
     spent = [record["seconds"].get(name) for name in ("forward", "backward")]
     return None if None in spent else sum(spent)
 
@@ -98,7 +91,6 @@ def cost(record: Record) -> float | None:
 
 
 def median_or_none(values: Iterable[float | None]) -> float | None:
-    """The median of the values that are not None; None without any."""
     numbers = [value for value in values if value is not None]
     return float(np.median(numbers)) if numbers else None
 
@@ -144,7 +136,7 @@ def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list
 
 
 def by_shape(values: dict[RunKey, float]) -> list[Any]:
-    """The numbers of runs as one array per shape, with an entry per seed; if shapes have views, a list of such arrays.
+    """One array per shape, with an entry per seed, of the numbers of runs; for shapes with views a list of such arrays.
 
     Runs with equal solid and view share an array, whatever else their keys have.
     """
@@ -156,8 +148,8 @@ def by_shape(values: dict[RunKey, float]) -> list[Any]:
 def definition(texts_by_names: dict[str, Any], name: str) -> Any:
     """The definition of a metric; empty without one.
 
-    A key lists names, such as "lost, false". A name also covers metrics of a band, such as "frontal.code_cosine", and
-    metrics that begin with it: "saved_..." covers saved_rays, and "depth_error" covers depth_error_p99.
+    A key lists names, such as "lost, false". A name also covers metrics of a band (frontal.code_cosine), and metrics
+    that begin with it: "saved_..." covers saved_rays, and "depth_error" covers depth_error_p99.
     """
     keys = [(alias.strip(), words) for key, words in texts_by_names.items() for alias in key.split(",")]
     last = name.rsplit(".", 1)[-1]

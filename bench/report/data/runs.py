@@ -49,25 +49,16 @@ ROW_SECTIONS = ("renderer", "task", "silhouette", "field")  # settings in which 
 
 @dataclass(frozen=True)
 class Selection:
-    """The runs that a study reads.
-
-    Args:
-        experiment: its name in the configurations of the runs.
-        conditions: settings in which runs of one row differ, such as task.points or split.
-        setup: parts of the setup that captions name if they are known.
-        alike: further parts of the configuration, such as task, in which only runs that equal the newest are read.
-        must_agree: further settings in which rows must agree to be compared, see `Runs.mixed`.
-        may_differ: settings in which rows that are compared may differ.
-    """
+    """The runs that a study reads."""
 
     WITHOUT_MACHINE: ClassVar[tuple[str, ...]] = ("scenes", "pixels", "network")  # a setup, of pages without runtimes
 
     experiment: str
-    conditions: tuple[str, ...] = ()
-    setup: tuple[str, ...] = (*WITHOUT_MACHINE, "machine")
-    alike: tuple[str, ...] = ()
-    must_agree: tuple[str, ...] = ()
-    may_differ: tuple[str, ...] = ()
+    conditions: tuple[str, ...] = ()  # settings in which runs of one row differ, such as task.points or split
+    setup: tuple[str, ...] = (*WITHOUT_MACHINE, "machine")  # parts of the setup that captions name if they are known
+    alike: tuple[str, ...] = ()  # parts of the configuration, such as task, that must equal those of the newest run
+    must_agree: tuple[str, ...] = ()  # further settings in which rows must agree to be compared, see `Runs.mixed`
+    may_differ: tuple[str, ...] = ()  # settings in which rows that are compared may differ
 
 
 class NoFolder(LookupError):
@@ -76,27 +67,21 @@ class NoFolder(LookupError):
 
 @dataclass(frozen=True)
 class Runs:
-    """The runs of an experiment in the order of their rows, including failed and planned ones.
-
-    Args:
-        left_out: by experiment, the number of runs at another scale, or replaced by a newer run of the same cell.
-        renamed: the rows of which runs with other settings are left out, with the keys of these settings.
-    """
+    """The runs of an experiment in the order of their rows, including failed and planned ones."""
 
     selection: Selection
     results_dir: Path
     records: list[Record]
-    left_out: Counter[str] = field(default_factory=Counter)
-    renamed: dict[str, list[str]] = field(default_factory=dict)
+    left_out: Counter[str] = field(default_factory=Counter)  # runs at another scale or replaced, by experiment
+    renamed: dict[str, list[str]] = field(default_factory=dict)  # left out: rows with other settings
     everything: list[Record] = field(default_factory=list, repr=False)
 
     @cached_property
     def frame(self) -> pd.DataFrame:
-        """The table of `bench.load` for these runs, in the order of `records`.
+        """The table of `bench.load` for these runs, in the order of `records`, with further columns.
 
-        Further columns: row, the name of the row in tables; preset, which decides its look; family; solid and view,
-        the numbers of the shape and of its view; loop, the seconds of the loop; values, the field evaluations including
-        coarse ones.
+        row, the name of the row in tables; preset, which decides its look; family; solid and view, the numbers of the
+        shape and of its view; loop, the seconds of the loop; values, the field evaluations including coarse ones.
         """
         table = to_frame(self.records)
         rows = [row_of(record) for record in self.records]
@@ -119,11 +104,7 @@ class Runs:
         return self.number(metric).where(ok, np.inf).fillna(np.inf) * scale
 
     def number(self, column: str, *, optional: bool = False) -> pd.Series:
-        """A column as floats; nan for missing values and text.
-
-        Raises:
-            ValueError: no run has this metric, and it is not optional.
-        """
+        """A column as floats; nan for missing values and text. Raises ValueError if no run has it, unless optional."""
         if not optional:
             self.check_metric(column)
         values = self.frame[column] if column in self.frame else pd.Series(np.nan, self.frame.index)
@@ -162,15 +143,10 @@ class Runs:
         return self.where(executed) if executed.any() else self
 
     def other(self, selection: Selection) -> "Runs | None":
-        """The runs of another experiment of the same results folder."""
         return choose(self.everything, selection, self.results_dir)
 
     def folder(self, record: Record) -> Path:
-        """The run folder of a record.
-
-        Raises:
-            NoFolder: the record was read from a shipped file, and has no folder here.
-        """
+        """The run folder of a record; raises NoFolder if it was read from a shipped file."""
         if FROM_RUNS_CSV in record:
             raise NoFolder(record["folder"])
         return self.results_dir / "runs" / record["folder"]
@@ -185,31 +161,22 @@ class Runs:
         return grouped(self.records, family)
 
     def named(self) -> list[Record]:
-        """The records with their readable names as `name`."""
         return [{**record, "name": name} for record, name in zip(self.records, self.names(), strict=True)]
 
     def names(self) -> list[str]:
         """A readable name of each run: its row, its conditions, and family, seed and shape if they vary."""
         getters = {"": family, "seed ": itemgetter("seed"), "shape ": index}
-        varying = {word: get for word, get in getters.items() if len({str(get(run)) for run in self.records}) > 1}
-        return [
-            row_of(record).name
-            + "".join(f", {value} {name}" for name, value in self._conditions(record))
-            + "".join(f", {word}{get(record)}" for word, get in varying.items())
-            for record in self.records
-        ]
-
-    def _conditions(self, record: Record) -> list[tuple[str, Any]]:
-        values = {
-            key.rpartition(".")[2]: setting(record["config"], *key.split(".")) for key in self.selection.conditions
-        }
-        return [(name, value) for name, value in values.items() if isinstance(value, str | int | float)]
+        varying = [(word, get) for word, get in getters.items() if len({str(get(run)) for run in self.records}) > 1]
+        names = []
+        for record in self.records:
+            values = {key: setting(record["config"], *key.split(".")) for key in self.selection.conditions}
+            shown = {key.rpartition(".")[2]: value for key, value in values.items()}
+            conditions = [f"{value} {key}" for key, value in shown.items() if isinstance(value, str | int | float)]
+            names.append(", ".join([row_of(record).name, *conditions, *(f"{w}{get(record)}" for w, get in varying)]))
+        return names
 
     def machines(self) -> dict[tuple[Any, ...], list[str]]:
-        """The names of the runs by machine: processor, accelerator, threads, and whether kernels are compiled.
-
-        A run that ended too early to record its processor is left out.
-        """
+        """The names of the runs by machine: processor, accelerator, threads, and whether kernels are compiled."""
 
         def machine_of(record: Record) -> tuple[Any, ...]:
             environment = record["environment"]
@@ -243,7 +210,6 @@ class Runs:
         return self.only(kept)
 
     def only(self, kept: list[Record]) -> "Runs":
-        """These runs; the others count as left out."""
         others = Counter({self.selection.experiment: len(self.records) - len(kept)})
         return replace(self, records=kept, left_out=self.left_out + others)
 

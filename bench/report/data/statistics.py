@@ -32,15 +32,12 @@ MIN_SHAPES = 6  # an interval of five shapes would cover their median with a pro
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate and the ends of its confidence interval; with too few shapes the ends are nan.
-
-    `points` are the estimates of the single shapes, which are shown instead of a missing interval.
-    """
+    """An estimate and the ends of its confidence interval, nan with too few shapes: then its `points` are shown."""
 
     value: float
     low: float
     high: float
-    points: tuple[float, ...] = field(default=(), compare=False, repr=False)
+    points: tuple[float, ...] = field(default=(), compare=False, repr=False)  # the estimates of the single shapes
 
     @property
     def has_ends(self) -> bool:
@@ -92,17 +89,11 @@ def shapes_won(first: Groups, second: Groups) -> float:
 def bootstrap(groups: Groups, statistic: Statistic, *, seed: int = 0, draws: int = 2000) -> Interval:
     """The statistic of all runs with its hierarchical bootstrap interval over shapes, views and seeds.
 
-    A draw takes shapes with replacement, then views of each drawn shape, then seeds of each drawn view (Davison and
-    Hinkley 1997, Sec. 3.8). The percentiles are widened for few shapes (Hesterberg 2015, "What teachers should know
-    about the bootstrap": expanded percentile interval). For interquartile means and medians of errors of six shapes or
-    more, the interval covers 95 % or more. If seeds vary as much as shapes, it is too wide (99 %), as the spread of
-    seeds enters at each stage.
-
-    Args:
-        statistic: reduces the last axis. It gets the runs of all shapes at once: a shape with more runs weighs more.
-
-    Returns:
-        Ends are draws, never interpolated, so they can be +inf; nan with fewer than `MIN_SHAPES` shapes.
+    A draw takes shapes with replacement, then views of each, then seeds of each (Davison and Hinkley 1997, Sec. 3.8).
+    The percentiles are widened for few shapes (Hesterberg 2015: expanded percentile interval). For interquartile means
+    and medians of six shapes or more, the interval covers 95 % or more; if seeds vary as much as shapes, 99 %.
+    `statistic` reduces the last axis, of the runs of all shapes: a shape with more runs weighs more. Ends are draws,
+    never interpolated, so they can be +inf; nan with fewer than `MIN_SHAPES` shapes.
     """
     (value,), (drawn,), points = _resample([groups], statistic, seed, draws)
     return _interval(value, drawn, points[0])
@@ -111,25 +102,15 @@ def bootstrap(groups: Groups, statistic: Statistic, *, seed: int = 0, draws: int
 def typical(groups: Groups) -> Interval:
     """The median over shapes of the geometric mean of their runs, with the interval of the sign test.
 
-    Its ends are values of shapes, so it is valid for any distribution. If 15 % of shapes fail badly, no interval of a
-    mean over 6 to 12 shapes covers 95 %.
-
-    Returns:
-        The ends are nan with fewer than `MIN_SHAPES` shapes; the median and the ends may be infinite.
+    Its ends are values of shapes, so it is valid for any distribution, and may be infinite.
     """
     return _median_interval(_shape_values(groups, geometric_mean))
 
 
 def ratio(first: Groups, second: Groups, *, of_shape: Statistic = geometric_mean) -> Interval:
-    """The median over shapes of the ratio of two errors, each the geometric mean of the shape's runs; see `typical`.
+    """The median over shapes of the ratio of two errors, each the geometric mean, or `of_shape`, of the shape's runs.
 
-    If both fail on a shape, its ratio is 1: neither is better.
-
-    Args:
-        of_shape: the statistic of the runs of a shape, in place of the geometric mean.
-
-    Raises:
-        ValueError: the two do not have the same shapes with the same numbers of views and seeds.
+    If both fail on a shape, its ratio is 1. Raises ValueError if the two have other shapes, views or seeds.
     """
     if _sizes(first) != _sizes(second):
         raise ValueError(f"{_UNEQUAL_SHAPES} {[_sizes(first), _sizes(second)]}: leave out what one of them lacks")
@@ -192,12 +173,11 @@ def shapes_agreeing(shapes: int, ratios: int) -> int:
 
 
 def _min_p_value(shapes: int) -> float:
-    """The p value of the sign test if all shapes are on one side of 1."""
     return 2.0 * 0.5**shapes
 
 
 def _sign_test_p_value(points: Sequence[float]) -> float:
-    """The two-sided p value of the sign test on values against 1; values of 1 do not count."""
+    """Two-sided, of values against 1; values of 1 do not count."""
     below, above = sum(x < 1 for x in points), sum(x > 1 for x in points)
     return min(1.0, 2 * float(special.bdtr(min(below, above), below + above, 0.5)))
 
@@ -207,7 +187,6 @@ def _shape_values(groups: Groups, statistic: Statistic) -> np.ndarray:
 
 
 def _median_interval(points: np.ndarray) -> Interval:
-    """The median of the shapes' values, with the interval of the sign test."""
     n = len(points)
     with np.errstate(divide="ignore", invalid="ignore"):  # log(0), and 0 next to inf: no median
         middle = math.exp(np.median(np.log(points)))
@@ -219,18 +198,11 @@ def _median_interval(points: np.ndarray) -> Interval:
 
 
 def share(successes: Values, trials: Values) -> Interval:
-    """The fraction of successes among all trials of all shapes, with an interval over shapes.
+    """The fraction of successes (a tie is half a one) among all trials of all shapes, with an interval over shapes.
 
-    The interval is that of `clopper_pearson` with as many trials as shapes. Trials of one shape are not independent.
+    The interval is that of `clopper_pearson` with as many trials as shapes, as trials of one shape are not independent.
     Their design effect (Rao and Scott 1992) cannot be estimated from so few shapes: intervals with it cover 91 % at 16
-    shapes.
-
-    Args:
-        successes: per shape; a tie is half a success.
-        trials: per shape, one or more.
-
-    Returns:
-        A fraction; the ends are nan with fewer than `MIN_SHAPES` shapes.
+    shapes. The ends are nan with fewer than `MIN_SHAPES` shapes.
     """
     k, m = np.asarray(successes, dtype=float), np.asarray(trials, dtype=float)
     if k.shape != m.shape or not k.size or not ((k >= 0) & (k <= m) & (m >= 1)).all():
@@ -254,11 +226,8 @@ def clopper_pearson(value: float, n: float) -> Interval:
 def rank(table: dict[Any, dict[Any, float | None]]) -> dict[Any, Interval]:
     """Each method's mean rank over the shapes with its bootstrap interval. Rank 1 is best; equal errors share a rank.
 
-    On a shape, a method without a finite error gets the worst rank: the number of methods. A shape on which all methods
-    fail is left out. With one shape the rank is nan. `Interval.points` are the ranks of the shapes.
-
-    Args:
-        table: the errors of each method by shape, or by another unit.
+    A method without a finite error on a shape gets the worst rank. A shape on which all methods fail is left out. With
+    one shape the rank is nan. `Interval.points` are the ranks of the shapes.
     """
     worst, several_shapes = float(len(table)), len({shape for errors in table.values() for shape in errors}) > 1
     errors = pd.DataFrame(table, dtype=float).replace(math.inf, math.nan).dropna(how="all")
@@ -345,10 +314,7 @@ def _sizes(groups: Groups) -> list[list[int]]:
 def _resample(
     series: Sequence[Groups], statistic: Statistic, seed: int, draws: int, fewest: int = MIN_SHAPES
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The statistic of each series [series], of each draw [series, draws], and of each shape [series, shapes].
-
-    There are no draws with fewer shapes than `fewest`.
-    """
+    """The statistic of each series [series], of each draw [series, draws] unless shapes are few, and of each shape."""
     sizes = [_sizes(groups) for groups in series]
     if not sizes or any(other != sizes[0] for other in sizes) or not all(min(level, default=0) for level in sizes[0]):
         raise ValueError(f"{_UNEQUAL_SHAPES} {sizes}: fill in with inf")

@@ -65,11 +65,10 @@ def columns(records: list[Record], folders: list[Folder]) -> dict[str, Any]:
 
 
 def names(records: list[Record]) -> list[str]:
-    """The name of each run: the name of its row, or of a user's class, and the settings in which runs differ.
+    """The name of each run: of its row or class, and at most `MAX_NAMED_SETTINGS` settings in which runs differ.
 
-    Settings are written as in the rows of a sweep. Those with a column of their own, such as seed and scale, are left
-    out. A setting is added only if it distinguishes runs of one task, row and scale that the settings before it do not;
-    at most `MAX_NAMED_SETTINGS` are added.
+    Settings with a column of their own are left out. A setting is added only if it distinguishes runs of one task, row
+    and scale that the settings before it do not.
     """
     run_names = [_base_name(record) for record in records]
     cache: dict[Hashable, dict[str, str]] = {}
@@ -144,9 +143,8 @@ TEXTS = {
 def _metrics(records: list[Record]) -> dict[str, Any]:
     columns = {}
     for key, metric in METRICS.items():
-        final, initial = (
-            [rounded(record[section].get(key)) for record in records] for section in ("metrics", "metrics_start")
-        )
+        sections = ("metrics", "metrics_start")
+        final, initial = ([rounded(record[section].get(key)) for record in records] for section in sections)
         if any(value is not None for value in final):
             shown_initial = initial if any(value is not None for value in initial) else None
             columns[key] = {"key": key, **metric._asdict(), "after": final, "before": shown_initial}

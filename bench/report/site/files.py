@@ -50,7 +50,6 @@ class Folder:
         return not linked or not is_outside(self.path / name, self.results_dir)
 
     def thumb(self) -> str:
-        """The picture that represents the run; empty without one."""
         return next((name for name in PICTURE_FILES if self.has(name)), "")
 
     def pictures(self) -> list[str]:

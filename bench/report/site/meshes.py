@@ -14,11 +14,7 @@ READ_ERRORS = (ArithmeticError, AttributeError, LookupError, MemoryError, Runtim
 
 
 def mesh_data(path: Path) -> dict[str, Any]:
-    """The mesh of a PLY file as arrays of Plotly's mesh3d, whose third axis is up; here the second axis is up.
-
-    Raises:
-        ValueError, OSError: the file is no mesh of triangles; the message says why.
-    """
+    """The mesh of a PLY file as arrays of Plotly's mesh3d, z up; raises ValueError or OSError for other files."""
     mesh = read_ply(path)
     small = simplify(mesh, MAX_SHOWN_VERTICES)
     x, y, z = small.vertices.T
@@ -66,5 +62,5 @@ def simplify(mesh: trimesh.Trimesh, max_vertices: int) -> trimesh.Trimesh:
 
 
 def _packed(array: np.ndarray, kind: str) -> dict[str, str]:
-    """An array in Plotly's base64 form."""
+    """In Plotly's base64 form."""
     return {"dtype": kind, "bdata": base64.b64encode(array.astype(f"<{kind}").tobytes()).decode("ascii")}

@@ -16,7 +16,6 @@ MAX_RAYS = 12
 
 
 def ray_file(number: int) -> str:
-    """The name of the picture of the ray of a pixel, counted from 1."""
     return f"{number:02d}.png"
 
 
@@ -58,6 +57,5 @@ def _drawn(folder: Folder) -> list[dict[str, Any]]:
 
 
 def _has(folder: Folder, name: str) -> bool:
-    """Whether the run has this file of rays, inside the results folder."""
     path: Path = folder.path / RAYS_FOLDER / name
     return path.is_file() and not is_outside(path, folder.results_dir)

@@ -15,10 +15,7 @@ SET_BY_SUITE = ("index=", "dataset=", "seed=", "task.", "sizes.", "experiment=")
 
 
 def renderers(records: list[Record], results_dir: Path) -> dict[str, Any]:
-    """The problems of the suite, and the progress of each row on each problem; shipped rows and the user's.
-
-    Without rows if a record is odd or foreign: then the suite has no page either, and the report says why.
-    """
+    """The problems of the suite, and the progress of each row on each; without rows if a record is odd or foreign."""
     try:
         return _progress_of_rows(records, results_dir)
     except paper.RECORD_ERRORS:
@@ -53,16 +50,12 @@ def _row(
     solved = [by_problem.get(problem) for problem in problems]
     keys = [run and (run.set, run.problem, run.budget, run.row, run.settings, run.started) for run in solved]
     first = next(attempts[key] for key in keys if key)
+    overrides = [text for text in first.overrides if not text.lstrip("+").startswith(SET_BY_SUITE)]
+    overrides = ["setting=tuned", f"renderer={first.preset}"] if first.tuned else overrides
     return {
         "row": row,
         "progress": [run and round(run.progress, 4) for run in solved],
         "failed": [[index, run.status, run.reason] for index, run in enumerate(solved) if run and not run.ok],
         "runs": [folders.get(key) for key in keys],
-        "command": shlex.join(["python", "-m", "bench.suite", *_overrides_of_row(first)]),
+        "command": shlex.join(["python", "-m", "bench.suite", *overrides]),
     }
-
-
-def _overrides_of_row(attempt: Attempt) -> list[str]:
-    if attempt.tuned:
-        return ["setting=tuned", f"renderer={attempt.preset}"]
-    return [text for text in attempt.overrides if not text.lstrip("+").startswith(SET_BY_SUITE)]

@@ -87,7 +87,6 @@ STATUSES = {
 
 
 def request_sentence(record: Record) -> str:
-    """The task, scene and size of the run, as a sentence."""
     config = record["config"]
     task_sentence = TASKS.get(record["task"], f"task={record['task']}")
     resolution, points = setting(config, "view", "resolution"), setting(config, "task", "points")

@@ -95,56 +95,41 @@ def _units(set_name: str, budget: float) -> float:
 
 @dataclass(frozen=True)
 class Attempt:
-    """A run of a renderer on a problem of the suite.
-
-    Args:
-        set, problem, scene: names. A scene has one problem in each set, in `pose` one per initial angle.
-        budget: the cost that the run could spend, in units of the set.
-        row, preset: the renderer's name in tables, and the preset that decides its look.
-        start, final: the errors before and after; `final` is infinite if the run did not end ok.
-        iterations, rays: number of iterations, and of rays in each.
-        cost, operations, seconds: of the loop; `cost` as `renderers.field.Counts.cost`.
-        waited: fraction of its time that the run waited for a processor.
-        settings, code: hashes of the settings that the set fixes, and of the code.
-        curve: cost, seconds and error at each checkpoint.
-        overrides: the command line that repeats the run.
-    """
+    """A run of a renderer on a problem of the suite."""
 
     set: str
-    problem: str
+    problem: str  # of the scene, which has one in each set, in `pose` one per initial angle
     scene: str
-    budget: float
-    row: str
-    preset: str
+    budget: float  # the cost that the run could spend, in units of the set
+    row: str  # the renderer's name in tables
+    preset: str  # it decides the row's look
     status: str
     reason: str
-    start: float
-    final: float
+    start: float  # the error before
+    final: float  # the error after; infinite if the run did not end ok
     iterations: int
-    rays: int
-    cost: float
+    rays: int  # of an iteration
+    cost: float  # of the loop, as `renderers.field.Counts.cost`
     operations: float | None
     seconds: float | None
-    waited: float | None
+    waited: float | None  # fraction of its time that the run waited for a processor
     cpu: str
     device: str
     threads: int | None
     kernels: str
     started: str
     commit: str
-    code: str
-    settings: str
-    curve: list[list[float]]
-    overrides: list[str]
+    code: str  # a hash
+    settings: str  # a hash of those that the set fixes
+    curve: list[list[float]]  # cost, seconds and error at each checkpoint
+    overrides: list[str]  # the command line that repeats the run
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """The identity of an attempt: set, problem, budget, row and settings."""
         return self.set, self.problem, self.budget, self.row, self.settings
 
     @property
     def ok(self) -> bool:
-        """Whether the run ended ok; the errors of other runs do not count."""
         return self.status == "ok"
 
     @property
@@ -164,7 +149,6 @@ def attempts_of(records: Iterable[Record], results_dir: Path) -> list[Attempt]:
 
 
 def newest_attempts(attempts: Iterable[Attempt]) -> list[Attempt]:
-    """The newest attempt of each key, whatever the order."""
     ordered = sorted(attempts, key=lambda attempt: (attempt.started, repr(attempt)))
     return [*{attempt.key: attempt for attempt in ordered}.values()]
 
@@ -253,16 +237,11 @@ def _rounded(number: float) -> float:
 
 
 def attempts_folder(results_dir: Path) -> Path:
-    """The folder of the attempts on this version of the suite."""
     return results_dir / SUITE_FOLDER / suite().id
 
 
 def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]:
-    """Merges attempts into those of a results folder; returns the files, one per row.
-
-    Raises:
-        ValueError: a file of the folder cannot be read, so its content would be lost.
-    """
+    """Merges attempts into those of a results folder; returns a file per row. Raises ValueError for a damaged file."""
     folder, (stored, problems) = attempts_folder(results_dir), read_attempts(results_dir)
     if problems:
         raise ValueError(
@@ -288,10 +267,7 @@ def _write_lines(path: Path, attempts: list[Attempt]) -> Path:
 
 @lru_cache(256)
 def _read_lines(path: Path, changed: int) -> list[Attempt]:
-    """Reads the attempts of a file, once per time of its change.
-
-    Raises one of `READ_ERRORS` if it is damaged, its columns are not those of today, or its numbers make no sense.
-    """
+    """Reads the attempts of a file, once per time of its change; raises one of `READ_ERRORS` if it is damaged."""
     with path.open(encoding="utf-8", newline="") as file:
         lines = [{f.name: _value(line[f.name], f.type) for f in fields(Attempt)} for line in csv.DictReader(file)]
     return [_checked(Attempt(**line)) for line in lines]
@@ -313,11 +289,7 @@ def read_attempts(*folders: Path) -> tuple[list[Attempt], list[str]]:
 
 
 def _checked(attempt: Attempt) -> Attempt:
-    """Returns the attempt if its numbers make sense.
-
-    Raises:
-        ValueError, TypeError: they do not.
-    """
+    """Returns the attempt; raises ValueError or TypeError if its numbers make no sense."""
     numbers = [attempt.start, attempt.final, attempt.cost, *(number for point in attempt.curve for number in point)]
     costs, end = [point[:2] for point in attempt.curve], [[attempt.cost, _rounded(attempt.final)]]
     if any(as_number(number) is None or number < 0 for number in numbers) or any(len(p) != 3 for p in attempt.curve):
@@ -331,15 +303,12 @@ def _checked(attempt: Attempt) -> Attempt:
 
 @dataclass(frozen=True)
 class Gathered:
-    """All attempts in any order, the `local` ones of a results folder, and a message for each unreadable file.
-
-    `second_starts` are apart from both, with the names of their rows.
-    """
+    """All attempts in any order, the `local` ones of a results folder, and a message for each unreadable file."""
 
     everything: list[Attempt]
     local: list[Attempt]
     problems: list[str]
-    second_starts: list[Attempt] = field(default_factory=list)
+    second_starts: list[Attempt] = field(default_factory=list)  # apart from both, with the names of their rows
 
     @property
     def size(self) -> str:

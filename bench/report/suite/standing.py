@@ -62,9 +62,8 @@ class Standing:
 def frame_of(attempts: Iterable[Attempt]) -> tuple[pd.DataFrame, dict[str, int]]:
     """A line per attempt, the oldest first; a key may have several. Also the number of attempts left out, by row.
 
-    Its columns: the fields of the attempt, `ok`, `tuned`, `machine`, and `timed` (the machine was not busy, and
-    the seconds are stored). Attempts with other settings than most of their set are left out; settings of tuned rows
-    are compared separately.
+    Attempts with other settings than most of their set are left out, apart from tuned ones. `timed`: the machine was
+    not busy, and the seconds are stored.
     """
     lines = [vars(attempt) | {"ok": attempt.ok, "tuned": attempt.tuned} for attempt in attempts]
     columns = [*Attempt.__dataclass_fields__, "ok", "tuned"]
@@ -95,13 +94,8 @@ def compared(everything: pd.DataFrame, size: str = "quick") -> pd.DataFrame:
     them. If DIST lacks one of them, it needs all of DIST's. The budget must also pay for enough iterations in at least
     half of the problems of each set. Other rows stay in the frame, but are not compared.
 
-    Args:
-        everything: the result of `frame_of`.
-
-    Returns:
-        A line per attempt with further columns: `missing`, the number of problems that its row lacks at the budget;
-        `too_expensive`, the sets in which it cannot run at the budget; `complete`; and `initial` and `reference`, the
-        errors that progress is measured between.
+    Further columns: `missing`, the number of problems that its row lacks at the budget; `too_expensive`, the sets in
+    which it cannot run; `complete`; and `initial` and `reference`, the errors that progress is measured between.
     """
     newest = everything.drop_duplicates([*KEY, "row"], keep="last")
     parts = [_compared_at_budget(runs, problems_of(size)) for _, runs in newest.groupby("budget")]
@@ -172,29 +166,19 @@ def second_starts(attempts: Iterable[Attempt], first: pd.DataFrame) -> pd.DataFr
 
 
 def units(budget: float) -> str:
-    """A budget as text, such as 1 unit or 10 units."""
     return f"{budget:g} {'unit' if budget == 1 else 'units'}"
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """The progress of rows at a budget, and which of them differ significantly.
+    """The progress of rows at a budget, and which of them differ significantly."""
 
-    Args:
-        progress: the mean over sets of the mean over problems, by row, the largest first.
-        better: the significant pairs, the row with more progress first.
-        pairs: the number of all pairs.
-        least_p: the least p value of all pairs; 1 without pairs.
-        scenes: the number of scenes, the units of the test.
-        level: the fraction of simulated draws of equal rows with a significant pair; 0 if it was not simulated.
-    """
-
-    progress: dict[str, float]
-    better: set[tuple[str, str]]
-    pairs: int
-    least_p: float
-    scenes: int
-    level: float = 0.0
+    progress: dict[str, float]  # the mean over sets of the mean over problems, the largest first
+    better: set[tuple[str, str]]  # the significant pairs, the row with more progress first
+    pairs: int  # the number of all pairs
+    least_p: float  # of all pairs; 1 without pairs
+    scenes: int  # the number of scenes, the units of the test
+    level: float = 0.0  # the fraction of simulated draws of equal rows with a significant pair; 0 if not simulated
 
     @property
     def decidable(self) -> bool:
@@ -203,7 +187,6 @@ class Ranking:
 
     @property
     def possible_p(self) -> float:
-        """The smallest p value that this number of scenes can give."""
         return 1 / len(flips.signs(self.scenes))
 
     def rank(self, row: str) -> str:
@@ -213,10 +196,7 @@ class Ranking:
 
 
 def ranking(runs: pd.DataFrame) -> Ranking:
-    """Ranks rows that have the same problems by their progress.
-
-    The signs of scenes' differences are flipped, with Holm's step-down correction over all pairs of rows.
-    """
+    """Ranks rows with the same problems by sign flips of scenes' differences, with Holm's correction over all pairs."""
     scores = by_scene(runs)
     first, second = np.triu_indices(scores.shape[1], 1)
     differences = scores.to_numpy()[:, first] - scores.to_numpy()[:, second]
@@ -227,7 +207,6 @@ def ranking(runs: pd.DataFrame) -> Ranking:
 
 
 def progress_of(scores: pd.DataFrame) -> dict[str, float]:
-    """The progress of each row, the largest first, from the result of `by_scene`."""
     return scores.sum().sort_values(ascending=False, kind="stable").to_dict()
 
 
@@ -267,8 +246,7 @@ def by_scene(runs: pd.DataFrame) -> pd.DataFrame:
 def bounds(runs: pd.DataFrame) -> tuple[float, float] | None:
     """The bounds of the mean final errors of all rows relative to DIST's, in runs of one set at one budget.
 
-    The means are geometric, over scenes, see `flips.bounds`, without rows that mostly failed. None if the set has too
-    few scenes, or no row of DIST.
+    Geometric means over scenes, see `flips.bounds`, without rows that mostly failed. None if there are too few scenes.
     """
     runs = runs[runs.groupby("row")["ok"].transform("mean") >= 0.5]
     errors = np.log(runs["final"].where(runs["ok"], runs["initial"]).clip(lower=MIN_LOG_ERROR))
@@ -280,11 +258,7 @@ def bounds(runs: pd.DataFrame) -> tuple[float, float] | None:
 
 
 def seconds_per_unit(everything: pd.DataFrame) -> pd.DataFrame:
-    """The runtime of one unit of cost by set and row, on the machine with most runs that had no other load.
-
-    Returns:
-        The columns `seconds`, the median over runs, and `timed`, their number.
-    """
+    """Median `seconds` of a unit and number of `timed` runs, by set and row, on the machine with most quiet runs."""
     runs = everything.drop_duplicates([*KEY, "row", "started"])  # a run may be shipped and local
     runs = runs[runs["timed"] & runs["ok"] & (runs["cost"] > 0)]
     runs = runs[runs["machine"].isin(runs["machine"].mode().iloc[:1])]

@@ -55,11 +55,7 @@ def undefined(values: Iterable[float]) -> str:
 
 
 def warnings(runs: Runs, *, with_times: bool = True) -> list[str]:
-    """Notes on differing settings, incomparable or doubtful times, and missing runs.
-
-    Args:
-        with_times: whether the page has runtimes, or would have them on a machine without other load.
-    """
+    """Notes on differing settings, incomparable or doubtful times (if the page has times), and missing runs."""
     with_times = with_times and "machine" in runs.selection.setup
     timing = (_machines(runs), _loaded(runs)) if with_times else ()
     notes = (_mixed(runs), *timing, _omitted(runs), _renamed(runs))

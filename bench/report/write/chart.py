@@ -22,12 +22,10 @@ Panel = dict[str, Any]
 
 
 def series(name: str, preset: str, x: Iterable[float | Interval], y: Iterable[float | Interval], **more: Any) -> Series:
-    """Points with the colour and marker of their preset, the same in every figure; estimates have intervals.
+    """Points with the colour and marker of their preset; estimates along y, or x with named rows, have intervals.
 
-    Args:
-        x, y: the values. Those of y (those of x in a panel with named rows) may be estimates. If one has no interval,
-            small points show its shapes.
-        more: further data for the page, such as `text`, `link` and `hollow`, see `page/parts/chart.js`.
+    If an estimate has no interval, small points show its shapes. `more` is data for the page, see
+    `page/parts/chart.js`.
     """
     look, x, y = _look(name, preset), list(x), list(y)
     points = {"name": name, "x": _values(x), "y": _values(y), "colour": look.colour, "symbol": look.marker}
@@ -52,12 +50,10 @@ def _shape_points(x: float | Interval, y: float | Interval) -> Iterable[tuple[fl
 
 
 def curve(name: str, preset: str, x: Iterable[float], y: Iterable[float | Interval], **more: Any) -> Series:
-    """A `series` whose points a line joins."""
     return series(name, preset, x, y, **{"dash": _look(name, preset).line} | more)
 
 
 def link_to_runs(text: str) -> str:
-    """A link to the page's list of runs that contain a text."""
     return "#/runs?task=all&view=runs&" + urlencode({"q": text})
 
 
@@ -78,11 +74,7 @@ def front(x: Iterable[float], y: Iterable[float]) -> Series:
 def panel_data(title: str, x: str, y: str, series: list[Series], **more: Any) -> Panel:
     """A panel of a chart. An axis is logarithmic if its values are positive and span a factor above 3.
 
-    An axis with named positions is never logarithmic.
-
-    Args:
-        x, y: the titles of its axes, with the unit.
-        more: further data for the page; `ticks` and `rows`, the names of the positions 0, 1, ... along x and down y.
+    An axis with named positions, `ticks` along x or `rows` down y in `more`, is never logarithmic.
     """
     axes = {}
     for letter, name, names in (("x", x, "ticks"), ("y", y, "rows")):
@@ -95,19 +87,13 @@ def panel_data(title: str, x: str, y: str, series: list[Series], **more: Any) ->
 def sheet(
     height: float, lines: int = 1, columns: int = 1, *, width: float = figure_style.WIDTH, **how: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A figure of that size in inches, and its axes [lines, columns]."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(lines, columns, squeeze=False, **how)
 
 
 @figure_style.styled
 def draw(panels: Sequence[Panel], height: float, lines: int = 1, *, legend: int = 4, **how: Any) -> Figure:
-    """Draws panels as a figure: `height` in inches, `lines` lines of panels, one legend below.
-
-    Args:
-        legend: the columns of the legend; 0 for none.
-        how: the width of the figure and what its axes share, see `sheet`.
-    """
+    """Draws panels in lines, `height` inches high, with a legend of so many columns below; `how`: see `sheet`."""
     columns = -(-max(len(panels), 1) // lines)
     figure, axes = sheet(height, lines, columns, **how)
     size = {True: len(panels), "row": columns}.get(how.get("sharey"), 1)  # panels that share an axis share its edge
@@ -127,7 +113,6 @@ def _shown(panel: Panel) -> list[Series]:
 
 
 def _drawn(panel: Panel, letter: str) -> list[float]:
-    """All values along an axis, including shapes and ends of intervals; these are along x if rows have names."""
     ends = ("low", "high") if letter == ("x" if "rows" in panel else "y") else ()
     values = [v for each in _shown(panel) for key in (letter, *ends) for v in each.get(key, ())]
     return values + [pair["xy".index(letter)] for each in _shown(panel) for pair in each.get("shapes", ())]
@@ -168,12 +153,7 @@ def _side_by_side(all_series: Sequence[Series], *, log: bool) -> list[Series]:
 
 
 def _series(axis: Axes, each: Series, edges: list[float], *, across: bool, bars: bool) -> None:
-    """Draws a series: intervals as a band or bars, infinite values at the edge, infinite points as crosses.
-
-    Args:
-        across: whether intervals are along x.
-        bars: whether the intervals of a line are bars.
-    """
+    """Draws a series: intervals, along x if `across`, as a band or bars; infinite values at the edge or as crosses."""
     x, y, line = np.minimum(each["x"], edges[0]), np.minimum(each["y"], edges[1]), "dash" in each
     style_options: dict[str, Any] = {"color": each["colour"], "marker": each["symbol"], "ls": each.get("dash", "none")}
     style_options |= {"markevery": max(len(x) // 6, 1)} if line else {}
@@ -198,5 +178,4 @@ def _series(axis: Axes, each: Series, edges: list[float], *, across: bool, bars:
 
 
 def _values(values: Iterable[float | Interval]) -> list[float]:
-    """The values, or those of estimates, with five digits."""
     return [float(f"{value.value if isinstance(value, Interval) else value:.5g}") for value in values]

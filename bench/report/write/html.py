@@ -39,13 +39,9 @@ ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=True, separators=(",", 
 
 
 def write_index(results_dir: Path, *, meshes: int | None = MAX_MESHES) -> Path:
-    """Writes `index.html` and the folder `page` from all run folders in `results_dir/runs`; returns the page.
+    """Writes `index.html` and the folder `page` from all run folders, with meshes of the newest; returns the page.
 
-    Args:
-        meshes: the number of runs, the newest first, whose mesh is prepared for the page; None for all.
-
-    Raises:
-        ValueError: `results_dir` is not a folder, or a folder of the page is a link that leads out of it.
+    Raises ValueError if `results_dir` is no folder, or a folder of the page is a link that leads out of it.
     """
     check_results(results_dir)
     with page_lock(results_dir):
@@ -54,10 +50,7 @@ def write_index(results_dir: Path, *, meshes: int | None = MAX_MESHES) -> Path:
 
 @contextmanager
 def page_lock(results_dir: Path) -> Iterator[None]:
-    """Locks the page while records are read and it is written, so that the last of two writers sees the runs of both.
-
-    A process that waits longer than `SILENT_WAIT_SECONDS` prints a message.
-    """
+    """Locks the page from reading records until it is written, so that the last writer sees the runs of both."""
     lock = file_lock(results_dir, PAGE_FOLDER)
     try:
         lock.acquire(timeout=SILENT_WAIT_SECONDS)
@@ -112,20 +105,17 @@ def _write_meshes(folders: list[Folder], data: Path, max_meshes: int | None) -> 
         source = folder.path / "mesh.ply"
         is_current = _is_newer(data / "mesh" / f"{folder.key}.js", source, folder.key)
         if not is_current and (max_meshes is None or number < max_meshes):
-            write_script(data, "mesh", folder.key, _mesh(source))
+            from bench.report.site.meshes import mesh_data  # imported here: runs without meshes need no trimesh
+
+            try:
+                mesh = mesh_data(source)
+            except (OSError, ValueError) as error:
+                mesh = {"none": f"The mesh cannot be shown: {error}."}
+            write_script(data, "mesh", folder.key, mesh)
             is_current = True
         if is_current:
             kept.append(folder.key)
     remove_others(data / "mesh", kept)
-
-
-def _mesh(source: Path) -> dict[str, Any]:
-    from bench.report.site.meshes import mesh_data  # imported here: runs without meshes need no trimesh
-
-    try:
-        return mesh_data(source)
-    except (OSError, ValueError) as error:
-        return {"none": f"The mesh cannot be shown: {error}."}
 
 
 def _is_newer(path: Path, source: Path, key: str) -> bool:
@@ -148,7 +138,6 @@ def _copy_assets(folder: Path) -> None:
 
 
 def _copy_pictures(folder: Path, sources: Iterable[Path]) -> None:
-    """Copies pictures into a folder, and removes the others."""
     current = {source.name: source for source in sources}
     for name, source in current.items():
         write_file(folder / name, source.read_bytes())
@@ -158,10 +147,7 @@ def _copy_pictures(folder: Path, sources: Iterable[Path]) -> None:
 
 
 def to_script(kind: str, key: str, data: Any) -> str:
-    """A script that hands data to the page: `implicitBench.receive(kind, key, data)`, in ASCII.
-
-    Numbers that are not finite are the strings "inf", "-inf" and "nan".
-    """
+    """A script, in ASCII, that hands data to the page: `implicitBench.receive(kind, key, data)`."""
     arguments = (safe_json(argument) for argument in (kind, key, data))
     return f"implicitBench.receive({', '.join(arguments)});\n"
 

@@ -54,11 +54,9 @@ RECORD_ERRORS = (KeyError, ValueError, TypeError, IndexError, AttributeError, Ar
 
 @dataclass(frozen=True)
 class Study:
-    """A file of `bench/studies`: the runs that it reads, and a function for each of its pages.
+    """A file of `bench/studies`: its `PLACE` among all files, a `Selection` for each argument in `READS`, and `PAGES`.
 
-    A file has `PLACE`, its position among all files; `READS`, a `Selection` for each argument of its functions; and
-    `PAGES`, these functions by the names of their pages. It may have `KEEPS`, which returns the folder of its rows in a
-    results folder: then its pages are also made without runs.
+    It may have `KEEPS`, which returns the folder of its rows in a results folder: then its pages are made without runs.
     """
 
     order: int
@@ -68,13 +66,10 @@ class Study:
     keeps: Callable[[Path], Path] | None = None
 
     def results(self, records: list[dict[str, Any]], results_dir: Path) -> dict[str, Result]:
-        """The result of each page; empty if there are neither runs nor kept rows.
+        """The result of each page; empty without runs and kept rows. Raises ValueError for an unknown experiment.
 
         A page that needs run folders uses the runs that have them; it is left out if these are the minority. A page
         that shows none of the runs is left out too.
-
-        Raises:
-            ValueError: the study reads an experiment that neither a run nor a file of `conf/experiment` names.
         """
         experiments = {record["config"].get("experiment") for record in records} | _experiments()
         for name in (selection.experiment for selection in self.reads if selection.experiment not in experiments):
@@ -127,13 +122,10 @@ def write_paper(
     problems: list[str] | None = None,
     only: str | None = None,
 ) -> list[Path]:
-    """Writes the files of every page that has runs to the folder `paper`; returns the pages' CSVs.
+    """Writes the files of every page that has runs, or of one, to the folder `paper`; returns the pages' CSVs.
 
-    Args:
-        output_dir: the folder that gets `paper`; by default the results folder. Another folder is shipped: it gets no
-            pages of runs of scale=smoke.
-        problems: gets a line for each study that fails on these runs; without it, the error is raised.
-        only: the name of the only page to write.
+    Another `output_dir` than the results folder gets no pages of scale=smoke. `problems` gets a line for each study
+    that fails; without it, the error is raised.
     """
     written = []
     for study in studies() if only is None else [study for study in studies() if only in study.pages]:
@@ -160,10 +152,9 @@ def write_paper(
 
 @dataclass(frozen=True)
 class Page:
-    """A table or figure of a results folder: its name, its content, its picture and its files by kind.
+    """A table or figure: its picture and files by kind, as percent-encoded paths relative to the results folder.
 
-    Paths of files are relative to the results folder and percent-encoded. A shipped page has no files. Its picture is
-    the copy in `page/shipped`, if it has no chart.
+    A shipped page has no files. Its picture is the copy in `page/shipped`, if it has no chart.
     """
 
     name: str
@@ -179,13 +170,11 @@ def find_paper(results_dir: Path) -> list[Page]:
     own_pages = _pages_of(results_dir)
     own_names = {page.name for page in own_pages}
     others = [] if results_dir.resolve() == SHIPPED else _pages_of(SHIPPED)
-    shipped = [page for page in others if page.name not in own_names]
-    return own_pages + [replace(page, picture=_copied_picture(page), files={}, shipped=True) for page in shipped]
-
-
-def _copied_picture(page: Page) -> str | None:
-    has_chart = page.shown.chart or page.shown.atlas
-    return None if has_chart or page.picture is None else link(*COPIES, f"{page.name}.png")
+    for page in (page for page in others if page.name not in own_names):
+        is_copied = page.picture is not None and not (page.shown.chart or page.shown.atlas)
+        picture = link(*COPIES, f"{page.name}.png") if is_copied else None
+        own_pages.append(replace(page, picture=picture, files={}, shipped=True))
+    return own_pages
 
 
 def _pages_of(results_dir: Path) -> list[Page]:
@@ -243,10 +232,8 @@ def _shipped_rows(page: Page, results_dir: Path) -> list[list[str]]:
 def ship(records: list[dict[str, Any]], results_dir: Path, output_dir: Path) -> list[Path]:
     """Adds the runs to the shipped files of runs, and redraws the shipped pages, also without run folders.
 
-    A page that cannot be redrawn keeps its content, and its head names the version that drew it.
-
-    Raises:
-        ValueError: shipped files cannot be read, so their rows would be lost.
+    A page that cannot be redrawn keeps its content, and its head names the version that drew it. Raises ValueError for
+    damaged files.
     """
     all_records = join(records, read_rows(output_dir / FOLDER))
     experiments = [selection.experiment for study in studies() if study.keeps is None for selection in study.reads]
@@ -262,11 +249,7 @@ def ship(records: list[dict[str, Any]], results_dir: Path, output_dir: Path) -> 
 
 
 def write_columns(results_dir: Path, options: dict[str, str]) -> None:
-    """Writes the LaTeX table of each page or sweep with a key `columns.NAME` again, with only these headings.
-
-    Raises:
-        ValueError: there is no such table, or it has no such column.
-    """
+    """Writes the LaTeX table of each page or sweep with a key `columns.NAME` again, with only these headings."""
     tables = {page.name: page for page in [*_pages_of(results_dir), *find_sweeps(results_dir)] if page.shown.columns}
     for key in (key for key in options if key.startswith("columns.")):
         if (page := tables.get(key.removeprefix("columns."))) is None:

@@ -63,46 +63,26 @@ _MARKDOWN = str.maketrans({character: f"&#{ord(character)};" for character in "|
 
 @dataclass(frozen=True)
 class Result:
-    """A table, a figure or both, with the question that it answers.
-
-    Args:
-        runs: the runs that it shows.
-        title: its title, as a sentence.
-        plotted: what is plotted, as a sentence.
-        question: as a reader would ask it; empty for a page of pictures.
-        verdict: the answer, one sentence with its numbers between asterisks; empty if the runs do not give it.
-        command: the command that makes the runs; empty if it is that of the experiment.
-        folders: the folders of the runs by the text of a line's first cell, for the links of the page.
-        n: the sample as text; by default the numbers of runs, shapes and seeds.
-        interval: the kind of interval; empty for none.
-        estimates: the shown estimates, which may lack an interval; empty if every interval exists.
-        remarks: further notes; empty ones are left out.
-        columns: the columns of the table.
-        lines: the lines of the table, as its columns read them.
-        run_columns: the columns of the raw numbers if these have a line per run.
-        data: the raw numbers, including those of the figure; by default they follow from the columns.
-        chart: panels of series for the page, see `chart.panel_data`.
-        atlas: a grid of cells for the page, see the study `stability`.
-    """
+    """A table, a figure or both, with the question that it answers."""
 
     runs: Runs
-    title: str
-    plotted: str
-    question: str = ""
-    verdict: str = ""
-    command: str = ""
-    folders: dict[str, list[str]] = field(default_factory=dict)
-    n: str = ""
-    interval: str = ""
-    estimates: Iterable[Interval] = ()
-    remarks: Iterable[str] = ()
+    title: str  # as a sentence
+    plotted: str  # what is plotted, as a sentence
+    question: str = ""  # as a reader would ask it; empty for a page of pictures
+    verdict: str = ""  # the answer, one sentence with its numbers between asterisks; empty if the runs do not give it
+    command: str = ""  # that makes the runs; empty: that of the experiment
+    folders: dict[str, list[str]] = field(default_factory=dict)  # of runs, by the text of a first cell
+    n: str = ""  # the sample; empty: the numbers of runs, shapes and seeds
+    interval: str = ""  # its kind; empty for none
+    estimates: Iterable[Interval] = ()  # that may lack an interval; empty if every interval exists
+    remarks: Iterable[str] = ()  # further notes; empty ones are left out
     columns: Sequence[Column] = ()
-    lines: Sequence[Any] = ()
-    run_columns: Sequence[Column] = ()
-    data: pd.DataFrame | None = None
+    lines: Sequence[Any] = ()  # as the columns read them
+    run_columns: Sequence[Column] = ()  # of the raw numbers if these have a line per run
+    data: pd.DataFrame | None = None  # the raw numbers, including those of the figure; None: by the columns
     figure: Figure | None = None
-    chart: dict[str, Any] | None = None
-    atlas: dict[str, Any] | None = None
+    chart: dict[str, Any] | None = None  # panels of series for the page, see `chart.panel_data`
+    atlas: dict[str, Any] | None = None  # a grid of cells for the page, see the study `stability`
 
     def __post_init__(self) -> None:
         for column in self.columns:
@@ -124,7 +104,6 @@ class Result:
 
     @cached_property
     def caption(self) -> str:
-        """What is plotted, n, the interval, what failed, and the machine."""
         interval = caption.interval_text(self.interval, self.estimates, drawn=self.figure is not None)
         return caption.caption(self.runs, self.plotted, n=self.n, interval=interval)
 
@@ -226,10 +205,7 @@ def _is_valid(name: str, value: Any) -> bool:
 
 
 def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[Path]:
-    """Writes `base.csv`, `.json` and `.md`, and `.tex`, `.png` and `.pdf` if there is content; returns the paths.
-
-    The label in LaTeX is `tab:NAME`; by default NAME is the name of the files.
-    """
+    """Writes `base.csv` and all of `write_shown`, `.png` and `.pdf` if there is a figure; returns the paths."""
     base.parent.mkdir(parents=True, exist_ok=True)
     table = base.with_suffix(".csv")
     _write_text(table, result.data.to_csv(index=False))
@@ -242,7 +218,7 @@ def write(result: Result, shown: Shown, base: Path, *, name: str = "") -> list[P
 
 
 def write_shown(shown: Shown, base: Path, *, name: str = "") -> list[Path]:
-    """Writes the content of a page: `base.json`, `.md`, and `.tex` if there is a table; returns the paths."""
+    """Writes `base.json`, `.md`, and `.tex`, with the label `tab:NAME`, if there is a table; returns the paths."""
     texts = {".json": shown.to_json(), ".md": markdown(shown, base.name)}
     if shown.columns:
         texts[".tex"] = latex(shown, name or base.name)
@@ -256,7 +232,6 @@ def _write_text(path: Path, text: str) -> None:
 
 
 def markdown(shown: Shown, name: str) -> str:
-    """The Markdown text of a page: head, question and verdict, title, caption, table, picture and notes."""
     head = [as_markdown(shown.head)] if shown.head else []
     question_part = [f"{as_markdown(shown.question)} **{as_markdown(shown.answer)}**"] if shown.verdict else []
     parts = [*head, *question_part, f"**{as_markdown(shown.title)}** {as_markdown(shown.caption)}"]
@@ -274,10 +249,7 @@ def markdown(shown: Shown, name: str) -> str:
 
 
 def latex(shown: Shown, name: str) -> str:
-    """A LaTeX table environment with the title, no larger than the page, and with rules between groups of lines.
-
-    Lines with equal text in the first column (written once) or in the second are a group. The caption is a comment.
-    """
+    """A LaTeX table environment with the title, no larger than the page; lines with equal first cells are a group."""
     cells = _emphasised(shown, _tex, r"\textbf{{\boldmath {}}}")
     columns = [[row[index] for row in shown.rows] for index in range(len(shown.columns))]
     for index, texts in enumerate(columns[:2]):
@@ -347,5 +319,4 @@ def as_markdown(text: str) -> str:
 
 
 def _flat(text: str) -> str:
-    """One line without control characters."""
     return "".join(c if c.isprintable() else " " for c in " ".join(str(text).split()))

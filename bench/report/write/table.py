@@ -58,25 +58,15 @@ def count_with_interval(number: float, total: int, rate: Interval) -> str:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """A column of a table."""
 
-    Args:
-        key: its name in the CSV; empty for a column of the readable table only.
-        heading: its name in the readable table; empty for a column of the CSV only.
-        value: returns the raw value of a line; by default `line.get(key)`.
-        show: converts the value to text for readers.
-        words: returns the text of a line for readers, if it depends on more than the value.
-        better: "lower" or "higher" if the best values of the column are bold; else empty.
-        is_metric: whether the key is a metric, which some run must have if the column is in the readable table.
-    """
-
-    key: str
-    heading: str = ""
-    value: Callable[[Any], Any] | None = None
+    key: str  # in the CSV; empty for a column of the readable table only
+    heading: str = ""  # in the readable table; empty for a column of the CSV only
+    value: Callable[[Any], Any] | None = None  # of a line; None: `line.get(key)`
     show: Callable[[Any], str] = format.number
-    words: Callable[[Any], str] | None = None
-    better: str = ""
-    is_metric: bool = False
+    words: Callable[[Any], str] | None = None  # the text of a line, if it depends on more than the value
+    better: str = ""  # "lower" or "higher" if the best values are bold
+    is_metric: bool = False  # some run must have it if the column has a heading
 
     def of(self, line: Any) -> Any:
         return line.get(self.key) if self.value is None else self.value(line)
@@ -119,7 +109,7 @@ def columns(show: Callable[[Any], str] = format.number, /, **headings: str) -> t
 
 
 def raw(*keys: str) -> tuple[Column, ...]:
-    """Columns of the CSV only."""
+    """Of the CSV only."""
     return tuple(map(Column, keys))
 
 
@@ -127,18 +117,14 @@ def text(key: str, heading: str = "", value: Callable[[Any], Any] | None = None)
     return Column(key, heading, value, show=word)
 
 
-def estimate(key: str, heading: str, ends: str = "") -> tuple[Column, ...]:
-    """The column of an estimate with its interval, and CSV columns of its ends; a line may lack the estimate.
-
-    Args:
-        ends: the prefix of `low` and `high` in the names of the CSV columns.
-    """
+def estimate(key: str, heading: str) -> tuple[Column, ...]:
+    """The column of an estimate, which a line may lack, and CSV columns of its ends."""
 
     def words(line: Any) -> str:
         return format.MISSING if line[key] is None else str(line[key])
 
     value = Column(key, heading, lambda line: line[key] and line[key].value, words=words)
-    low, high = (Column(f"{ends}{end}", value=lambda line, end=end: getattr(line[key], end, None)) for end in ENDS)
+    low, high = (Column(end, value=lambda line, end=end: getattr(line[key], end, None)) for end in ENDS)
     return value, low, high
 
 
@@ -152,14 +138,14 @@ def shown(heading: str, words: Callable[[Any], str]) -> Column:
     return Column("", heading, words=words)
 
 
-def joined_cell(get: Callable[[Any, str], Any], show: Callable[[Any], str], *keys: str) -> Callable[[Any], str]:
-    """A function that writes several values of a line into one cell; `get` reads a value by its key."""
+def joined(heading: str, get: Callable[[Any, str], Any], show: Callable[[Any], str], *keys: str) -> Column:
+    """A column of the readable table with several values of a line, which `get` reads by their keys."""
 
     def words(line: Any) -> str:
         texts = [show(get(line, key)) for key in keys]
         return format.MISSING if set(texts) == {format.MISSING} else " / ".join(texts)
 
-    return words
+    return shown(heading, words)
 
 
 def metric(name: str, heading: str = "", show: Callable[[Any], str] = format.number) -> Column:
@@ -167,7 +153,6 @@ def metric(name: str, heading: str = "", show: Callable[[Any], str] = format.num
 
 
 def metrics(*names: str) -> tuple[Column, ...]:
-    """Columns with metrics of each record, in the CSV only."""
     return tuple(metric(name) for name in names)
 
 
@@ -188,13 +173,7 @@ def extremes(
     show: Callable[[float], str] = format.number,
     largest_first: bool = False,
 ) -> str:
-    """A sentence with the best and the worst value and their rows; empty if no value is finite.
-
-    Args:
-        n: the sample in words.
-        show: formats a value.
-        largest_first: whether the largest value is the best, which comes first.
-    """
+    """A sentence with the best and the worst value and their rows, of a sample `n`; empty if no value is finite."""
     numbers = {row: value for row, value in values.items() if value is not None and not math.isnan(value)}
     ordered = sorted(numbers, key=lambda row: -numbers[row] if largest_first else numbers[row])
     if not ordered or math.isinf(numbers[ordered[0]]):

@@ -93,19 +93,13 @@ class PoseICP(PoseTask):
             motion = result.transformation
         depth_cloud.transform(motion)
         distances = depth_cloud.compute_point_cloud_distance(mesh_cloud) if result.fitness > 0 else [np.inf]
-        inverse = torch.from_numpy(np.linalg.inv(motion).copy()).float()
-        moved = Camera(camera.intrinsics, _rigid_part(camera.world_to_camera @ inverse), camera.height, camera.width)
-        return moved, float(np.mean(distances))
+        moved = camera.world_to_camera @ torch.from_numpy(np.linalg.inv(motion).copy()).float()
+        rotation = Rotation.from_matrix(moved[:3, :3].double().numpy())  # exact: float32 makes it slightly inexact
+        moved[:3, :3] = torch.from_numpy(rotation.as_matrix())
+        return Camera(camera.intrinsics, moved, camera.height, camera.width), float(np.mean(distances))
 
 
 def world_points(view: View, camera: Camera) -> Float[Tensor, "n 3"]:
     """The points of a depth image in world axes, if `camera` had taken it."""
     depth_per_distance = camera.depth(torch.ones(view.depth.shape))
     return camera.rays().at(view.depth / depth_per_distance)[view.mask]
-
-
-def _rigid_part(motion: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """The nearest rigid motion: products in float32 make a rotation slightly inexact."""
-    exact = motion.clone()
-    exact[:3, :3] = torch.from_numpy(Rotation.from_matrix(motion[:3, :3].double().numpy()).as_matrix())
-    return exact

@@ -86,9 +86,12 @@ def solve_by_growth(observations: RayObservations, pictured: InputView, run: Run
         first, last = State(growth.first, inputs), State(growth.fitted.model.frozen(), inputs)
         record.metrics_start, after = evaluate(first).metrics, evaluate(last)
         notes = (*growth.summary(choice.name), *fitter.notes[:1], *after.notes)
-        metrics = after.metrics | final_field_metrics(growth)
+        evidence = growth.fitted.evidence
+        error = {} if evidence.error is None else {"field_standard_error": evidence.error.standard_error}
+        costs = {"field_overhead": growth.overhead, "fields_tried": len(growth.tried)}
+        metrics = {**after.metrics, **evidence.field(), **error, "field_footprint": growth.footprint, **costs}
         note_result(run, replace(after, metrics=metrics, failure=failure_of(growth, after), notes=notes))
-        curve = rendered_curve(lines, growth.fitted.evidence.candidate)
+        curve = rendered_curve(lines, evidence.candidate)
         filmstrip = Filmstrip(inputs, "by candidate")
         for name, field in growth.fields.items():
             filmstrip.add(name, State(field, inputs))
@@ -105,18 +108,6 @@ def rendered_curve(lines: list[dict[str, Any]], candidate: str) -> list[dict[str
         numbers = {name: value for name, value in line.items() if name not in FIT_ONLY_KEYS}
         curve.append({**numbers, "iteration": index, "seconds": clock})
     return curve
-
-
-def final_field_metrics(growth: Growth) -> dict[str, Any]:
-    evidence = growth.fitted.evidence
-    error = {} if evidence.error is None else {"field_standard_error": evidence.error.standard_error}
-    return {
-        **evidence.field(),
-        **error,
-        "field_footprint": growth.footprint,
-        "field_overhead": growth.overhead,
-        "fields_tried": len(growth.tried),
-    }
 
 
 def failure_of(growth: Growth, after: Evaluation) -> tuple[RunStatus, str] | None:

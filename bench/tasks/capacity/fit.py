@@ -222,11 +222,7 @@ class WarmStart:
     where it should not be negative. Other fields are fitted to the values of a target field.
 
     Args:
-        model: the fitted model.
-        surface, free: points of the surface; points outside.
         target: the field whose values are fitted; None fits to the points.
-        count: number of points of each kind in an iteration.
-        seed: of the draws.
     """
 
     model: Model

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from bench.records.record import RunStatus
 from bench.tasks.capacity.held_out import HeldOutError
-from bench.tasks.capacity.settings import SIZE_WORDS
 from renderers.field import Counts, Field, Meter
 
 FLOAT_BYTES = 4  # float32
@@ -37,7 +36,6 @@ class Size:
         return FLOAT_BYTES * self.stored
 
     def by(self, measure: str) -> int:
-        assert measure in SIZE_WORDS
         return getattr(self, measure)
 
     def __str__(self) -> str:
@@ -49,12 +47,8 @@ class Model:
     """A field and its parameters.
 
     Args:
-        candidate: name of its candidate.
-        make: returns the field of parameters.
-        learning_rate: of Adam, for these parameters.
         metric: whether the values are distances or bounds by construction; otherwise an eikonal term is added.
         fixed_count: number of stored values that are not parameters.
-        sparse_bytes: see `Size`.
     """
 
     candidate: str
@@ -81,14 +75,7 @@ class Model:
 
 @dataclass(frozen=True)
 class StartInputs:
-    """The inputs of a candidate's start.
-
-    Args:
-        points: observed points of the surface.
-        previous: the best model so far, or None.
-        seed: of random draws.
-        device: of the parameters.
-    """
+    """The inputs of a candidate's start."""
 
     points: Float[Tensor, "n 3"]
     previous: Model | None
@@ -99,7 +86,6 @@ class StartInputs:
     @torch.no_grad()
     def previous_values(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """The previous model's values, counted, on the CPU."""
-        assert self.previous is not None
         return Meter(self.previous.frozen(), self.counts)(points.to(self.device)).cpu()
 
 
@@ -108,11 +94,8 @@ class Candidate:
     """A kind of field of a certain size.
 
     Args:
-        name: of the candidate.
-        stored: numbers, see `Size`; the number of free ones of a grid is not known in advance.
         flops: floating-point operations per evaluation; an estimate for primitives, where a power counts as 20.
         starts: returns models to start from; the model with the smallest loss after a short warm start is fitted.
-        tries: the largest number of starts.
         follows: whether it starts from the previous field, not from the observed points.
     """
 

@@ -31,12 +31,10 @@ def parse_field_name(name: str) -> tuple[str, tuple[int, ...]]:
     sizes = tuple(map(int, size.split("x")))
     if kind == "union":
         check_at_least("K of union_K", sizes[0], 2, "union_2 is the smallest")
-    if kind == "network":
-        check_at_least("network layers", sizes[0], 1, "network_1x16 is small")
-        check_at_least("network width", sizes[1], 4, "network_1x16 is small")
-    if kind == "fourier":
-        check_at_least("fourier layers", sizes[0], 1, "fourier_4x64 suits one shape")
-        check_at_least("fourier width", sizes[1], 4, "fourier_4x64 suits one shape")
+    if kind in ("network", "fourier"):
+        remedy = {"network": "network_1x16 is small", "fourier": "fourier_4x64 suits one shape"}[kind]
+        check_at_least(f"{kind} layers", sizes[0], 1, remedy)
+        check_at_least(f"{kind} width", sizes[1], 4, remedy)
     if kind == "hash" and not (2 <= sizes[0] <= 16 and 4 <= sizes[1] <= 19):
         raise ValueError(f"{name}: a hash grid has 2 to 16 levels, and 2^4 to 2^19 entries in each: hash_8x10")
     if kind == "grid" and not 8 <= sizes[0] <= MAX_GRID_SAMPLES:

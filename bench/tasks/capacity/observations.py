@@ -166,18 +166,15 @@ class Views:
         draw, highest = np.random.default_rng([seed, 3]), sin(radians(self.settings.elevation))
         angles = [(draw.uniform(0, 360), degrees(asin(draw.uniform(-highest, highest)))) for _ in range(count)]
         view, group = self._observe([self.sampler.camera(*pair) for pair in angles])
-        return held_out_rays(view, torch.ones_like(view.observed), group, self.footprint).thinned(
-            self.held_out_rays, seed
-        )
+        held_out = held_out_rays(view, torch.ones_like(view.observed), group, self.footprint)
+        return held_out.thinned(self.held_out_rays, seed)
 
     def _spread(self, count: int, turn: float) -> list[Camera]:
         """Cameras spread evenly over the belt of a sphere between the largest elevations (a Fibonacci lattice)."""
         highest = sin(radians(self.settings.elevation))
         heights = [highest * (1 - (2 * index + 1) / count) for index in range(count)]
-        return [
-            self.sampler.camera((turn + index * GOLDEN_ANGLE_DEGREES) % 360, degrees(asin(height)))
-            for index, height in enumerate(heights)
-        ]
+        angles = [((turn + i * GOLDEN_ANGLE_DEGREES) % 360, degrees(asin(height))) for i, height in enumerate(heights)]
+        return [self.sampler.camera(*pair) for pair in angles]
 
     def _observe(self, cameras: list[Camera]) -> tuple[ObservedView, Int[Tensor, " n"]]:
         views = [see(self.truth, camera) for camera in cameras]

@@ -169,12 +169,9 @@ def choice_metrics(choice: Choice, evidence: list[Evidence], growth: Growth) -> 
     if last.error is not None:
         target = last.mean + last.error.standard_error
         for fit in evidence:
-            reached: dict[str, float] = next(
-                (checkpoint for checkpoint in fit.checkpoints if checkpoint["error"] <= target), {}
-            )
-            metrics |= {
-                f"{fit.candidate}.{key}_at_auto": reached.get(key) for key in ("seconds", "flops", "evaluations")
-            }
+            first: dict[str, float] = next((reached for reached in fit.checkpoints if reached["error"] <= target), {})
+            for key in ("seconds", "flops", "evaluations"):
+                metrics[f"{fit.candidate}.{key}_at_auto"] = first.get(key)
     return metrics | savings(chosen, evidence)
 
 

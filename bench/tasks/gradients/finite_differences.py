@@ -260,6 +260,5 @@ def _by_weight(
 def _clear(field: Field, rays: Rays, distance: Float[Tensor, " m"], *, margin: Tensor) -> Bool[Tensor, " m"]:
     """Whether the field stays above `margin` along the ray until shortly before the hit."""
     entry, _, _ = sphere_span(rays)
-    return (field(rays.at_each(equally_spaced(entry, distance - EXCLUDED_BEFORE_HIT, CLEARANCE_SAMPLES))) > margin).all(
-        dim=1
-    )
+    samples = equally_spaced(entry, distance - EXCLUDED_BEFORE_HIT, CLEARANCE_SAMPLES)
+    return (field(rays.at_each(samples)) > margin).all(dim=1)

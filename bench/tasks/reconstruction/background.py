@@ -1,7 +1,6 @@
 """What rays see that pass the object, for photographs without masks."""
 
 from math import pi
-from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -16,14 +15,6 @@ GREYS = {"black": 0.0, "grey": 0.5, "white": 1.0}
 CHOICES = (NONE, *GREYS, SPHERE)
 NETWORK_WIDTH, NETWORK_OCTAVES, SAMPLES_PER_RAY = 64, 4, 16
 SPEED = 10.0
-
-
-class Background(Protocol):
-    """The colours behind the object."""
-
-    def __call__(self, rays: Rays) -> Float[Tensor, "n 3"]:
-        """RGB from 0 to 1 along n rays."""
-        ...
 
 
 class OneColour(nn.Module):
@@ -89,7 +80,10 @@ class OutsideSphere(nn.Module):
         return ((passing * (1 - transparency))[..., None] * colours.sigmoid()).sum(1)
 
 
-def make(name: str) -> OneColour | OutsideSphere | None:
+Background = OneColour | OutsideSphere  # gives RGB from 0 to 1 along n rays
+
+
+def make(name: str) -> Background | None:
     """The background of a name in `CHOICES`; None for "none"."""
     if name == SPHERE:
         return OutsideSphere()

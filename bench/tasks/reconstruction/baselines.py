@@ -1,6 +1,5 @@
 """Surfaces from photographs without a renderer: baselines for `reconstruction`."""
 
-from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,11 +18,7 @@ from renderers.checks import BadInput, check_at_least
 
 @dataclass(frozen=True)
 class _Surface(PhotographTask):
-    """A task that computes a surface without an optimisation loop."""
-
-    @abstractmethod
-    def surface(self, subject: Subject) -> Mesh | None:
-        """The surface of the input photographs."""
+    """A task whose method `surface` computes a mesh of a subject's input photographs; None if there is none."""
 
     def execute(self, run: RunContext) -> None:
         """Computes the surface of the input photographs with their colours, and evaluates it on the held-out ones."""

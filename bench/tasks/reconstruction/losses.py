@@ -85,12 +85,7 @@ class Losses:
             check_at_least(f"task.losses.{name}", getattr(self, name), 0, "0 switches the term off")
 
     def __call__(
-        self,
-        renderer: Renderer,
-        shape: Coloured,
-        metered: Meter,
-        pixels: Pixels,
-        background: Background | None = None,
+        self, renderer: Renderer, shape: Coloured, metered: Meter, pixels: Pixels, background: Background | None = None
     ) -> Terms:
         """The weighted terms and their sum, `total`.
 
@@ -170,7 +165,8 @@ class Losses:
             behind = torch.zeros_like(flat.directions) if background is None else background(flat)
             colours, compared_rays = behind.index_put((inside.flatten(),), surface), inside
         else:
-            colours, compared_rays = _volume_colours(shape, metered, flat, volume), pixels.inside(all_rays)
+            colours = volume.weighted_sum(_sample_colours(shape, metered, flat, volume), len(flat.origins))
+            compared_rays = pixels.inside(all_rays)
             if background is not None:
                 colours = colours + (1 - rendering.opacity.flatten()[:, None]) * background(flat)
         per_pixel = (compared_rays if background is None else all_rays).view(count, -1)
@@ -195,11 +191,6 @@ class Losses:
         if remedies := " ".join(f"task.{remedy}" for remedy, is_used in used.items() if is_used):
             reason = "several rays per pixel compare only colours and silhouettes"
             raise BadInput(f"{reason}: remove view.rays_per_pixel, or set {remedies}")
-
-
-def _volume_colours(shape: Coloured, field: Field, rays: Rays, volume: Volume) -> Float[Tensor, "n 3"]:
-    """The colours of rays through a volume in front of black: the weighted sums of the samples' colours."""
-    return volume.weighted_sum(_sample_colours(shape, field, rays, volume), len(rays.origins))
 
 
 def _sample_errors(shape: Coloured, field: Field, pixels: Pixels, volume: Volume) -> Float[Tensor, " n"]:

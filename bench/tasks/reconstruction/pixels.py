@@ -10,7 +10,7 @@ from torch import Tensor
 from bench.solve.pixel_area import random_offsets
 from bench.tasks.reconstruction.subject import given_distances
 from datasets.shot import Shot
-from renderers.camera import Camera, Rays, sphere_span
+from renderers.camera import Rays, sphere_span
 from renderers.checks import BadInput
 
 FILLED = 0.98  # a pixel above this covered fraction counts as filled: compressed and undistorted masks have noise
@@ -98,12 +98,16 @@ class Stack:
             torch.cat(areas).to(device) if areas else None,
         )
         in_sphere = sphere_span(all_rays)[2]
-        inner = torch.cat([_upper_left(shot) for shot in shots])
+        inner = [torch.zeros(shot.camera.height, shot.camera.width, dtype=torch.bool) for shot in shots]
+        for image in inner:  # pixels with a neighbour to the right and below
+            image[:-1, :-1] = True
+        useful, corners = in_sphere.nonzero().squeeze(-1), in_sphere & torch.cat([image.flatten() for image in inner])
         width = torch.cat([torch.full((depth.numel(),), depth.shape[1]) for depth in depths_at_one])
-        if not bool((in_sphere & inner).any()):
+        if not bool(corners.any()):
             raise BadInput("no ray meets the unit sphere: the cameras do not look at the object")
-        useful, corners = in_sphere.nonzero().squeeze(-1), (in_sphere & inner).nonzero().squeeze(-1)
-        steps = torch.stack([_pixel_steps(shot.camera) for shot in shots])
+        cameras = [(torch.linalg.inv(shot.camera.intrinsics), shot.camera.camera_to_world) for shot in shots]
+        steps = torch.stack([inverse[:, :2].T @ pose[:3, :3].T for inverse, pose in cameras])
+        corners = corners.nonzero().squeeze(-1)
         return Stack(pixels, useful.to(device), corners.to(device), width.to(device), steps.to(device))
 
     def draw(self, count: int, *, patches: bool, seed: int) -> Pixels:
@@ -124,15 +128,3 @@ class Stack:
         directions = at_unit_depth[:, None] + offsets @ self.steps[pixels.photograph].to(at_unit_depth)
         origins = pixels.rays.origins[:, None].expand_as(directions)
         return replace(pixels, rays=Rays(origins, torch.nn.functional.normalize(directions, dim=-1)))
-
-
-def _pixel_steps(camera: Camera) -> Float[Tensor, "2 3"]:
-    """See `Stack.steps`."""
-    return torch.linalg.inv(camera.intrinsics)[:, :2].T @ camera.camera_to_world[:3, :3].T
-
-
-def _upper_left(shot: Shot) -> Bool[Tensor, " pixels"]:
-    """True for pixels with a neighbour to the right and below."""
-    inner = torch.zeros(shot.camera.height, shot.camera.width, dtype=torch.bool)
-    inner[:-1, :-1] = True
-    return inner.flatten()

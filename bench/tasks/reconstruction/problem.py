@@ -16,7 +16,7 @@ from bench.pictures.filmstrip import Shown
 from bench.solve.latent_code import Terms
 from bench.solve.pixel_area import SEED_OF_RAYS
 from bench.solve.pixel_draw import generator_of
-from bench.tasks.reconstruction.background import OneColour, OutsideSphere
+from bench.tasks.reconstruction.background import Background
 from bench.tasks.reconstruction.blur import PointBlur
 from bench.tasks.reconstruction.cameras import CameraMotions
 from bench.tasks.reconstruction.judge import field_scores, judge, surface_scores
@@ -32,7 +32,6 @@ from renderers.fields.networks.coloured import ColouredDistance, ColouredEncoded
 from renderers.rendering import Renderer, at_iteration
 
 OBJECTIVE_PIXELS = 4096  # compared before and after the optimisation
-Behind = OneColour | OutsideSphere
 # Modules whose `field` is a Coloured.
 Learnt = ColouredDistance | ColouredEncoded | ColouredOccupancy | ColouredGrid
 
@@ -50,7 +49,7 @@ class ReconstructionProblem:
     iterations: int
     seed: int
     motions: CameraMotions
-    background: Behind | None = None
+    background: Background | None = None
     blur: PointBlur = field(default_factory=PointBlur)
     rays_per_pixel: int = 1
     counts: Counts = field(default_factory=Counts)

@@ -58,7 +58,13 @@ def stereo_clouds(shots: Sequence[Shot], matching: Matching) -> list[Cloud]:
     except ImportError:
         raise BadInput(f"task=stereo needs OpenCV: type {install_command('stereo')}") from None
     clouds = [_match(shot, other) for shot in shots for other in _neighbours(shot, shots, matching)]
-    return [Cloud(cloud.points[_inside_masks(shots, cloud.points)], cloud.camera) for cloud in clouds]
+    kept = []
+    for cloud in clouds:
+        points, inside = torch.from_numpy(cloud.points).float(), np.linalg.norm(cloud.points, axis=1) < 1
+        for shot in shots:
+            inside &= allowed_by_mask(shot, points).numpy()
+        kept.append(Cloud(cloud.points[inside], cloud.camera))
+    return kept
 
 
 def _neighbours(shot: Shot, shots: Sequence[Shot], matching: Matching) -> list[Shot]:
@@ -134,14 +140,6 @@ def _rectify(
     maps = cv2.initUndistortRectifyMap(intrinsics, None, rotation, projection, (side, side), cv2.CV_32FC1)
     image = (255 * shot.colours.numpy().clip(0, 1)).astype(np.uint8)
     return cv2.remap(image, *maps, cv2.INTER_LINEAR)
-
-
-def _inside_masks(shots: Sequence[Shot], points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """A mask of the points inside the unit sphere that no photograph's mask excludes."""
-    positions, inside = torch.from_numpy(points).float(), torch.from_numpy(np.linalg.norm(points, axis=1) < 1)
-    for shot in shots:
-        inside &= allowed_by_mask(shot, positions)
-    return inside.numpy()
 
 
 def allowed_by_mask(shot: Shot, points: Float[torch.Tensor, "n 3"], margin: float = 0.0) -> Bool[torch.Tensor, " n"]:

@@ -1,6 +1,5 @@
 """The input of a reconstruction: photographs, of which some are held out, and the true surface if it is known."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -162,7 +161,7 @@ def visible(scene: Truth, shot: Shot, sampled: Surface) -> Bool[np.ndarray, " n"
 
 
 @dataclass(frozen=True)
-class PhotographTask(ABC):
+class PhotographTask:
     """A task on photographs from a folder, or rendered from the scene's mesh.
 
     Args:
@@ -183,10 +182,6 @@ class PhotographTask(ABC):
     def __post_init__(self) -> None:
         check_at_least("task.longest", self.longest, 8, "96 shows what there is")
         check_at_least("task.held_out", self.held_out, 2, "8 holds out an eighth")
-
-    @abstractmethod
-    def execute(self, run: RunContext) -> None:
-        """Reconstructs the shape, and evaluates it on the held-out photographs."""
 
     def subject(self, inputs: RunInputs) -> Subject:
         """The photographs, and the true surface if it is known.

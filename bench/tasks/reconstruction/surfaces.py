@@ -53,9 +53,8 @@ def measured_clouds(path: str, subject: Subject) -> list[Cloud]:
         )
     if all(shot.mask is not None for shot in subject.input_shots):
         positions = torch.from_numpy(points).float()
-        points = points[
-            torch.stack([allowed_by_mask(s, positions, margin=1.0) for s in subject.input_shots]).all(0).numpy()
-        ]
+        allowed = [allowed_by_mask(shot, positions, margin=1.0) for shot in subject.input_shots]
+        points = points[torch.stack(allowed).all(0).numpy()]
     cameras = [shot.camera for shot in subject.input_shots]
     viewers = _nearest_viewers(torch.from_numpy(points).float(), cameras).numpy()
     return [Cloud(points[viewers == index], camera) for index, camera in enumerate(cameras)]

@@ -115,12 +115,8 @@ class Reconstruction(PhotographTask):
             models = {candidate: self.appearance.make(candidate) for candidate in candidates}
         for model in models.values():  # before the slow reading of photographs
             check_kind(inputs.renderer, model.field)
-        definitions = (
-            COLOURED_DEFINITIONS
-            | ({} if self.camera_noise is None else cameras.DEFINITIONS)
-            | COUNT_DEFINITIONS
-            | (DEFINITIONS if name == AUTO else {})
-        )
+        of_cameras = {} if self.camera_noise is None else cameras.DEFINITIONS
+        definitions = COLOURED_DEFINITIONS | of_cameras | COUNT_DEFINITIONS | (DEFINITIONS if name == AUTO else {})
         run.record.definitions = dict(definitions)
         subject = self.subject(inputs)
         unmasked = subject.input_shots[0].mask is None and self.background == behind.NONE

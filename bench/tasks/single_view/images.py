@@ -42,7 +42,6 @@ class Pictured(Protocol):
 
     def shots(self, split: Split, index: int, longest: int) -> tuple[Shot, ...] | None:
         """A shape's images with cameras in its mesh's world, `longest` pixels per side at most; None without any."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -140,12 +139,7 @@ def as_input(
 
 @dataclass(frozen=True)
 class Imaging:
-    """Settings of the images.
-
-    Args:
-        photography: texture, light, noise.
-        sampler: of the cameras.
-    """
+    """Settings of the images."""
 
     photography: Photography
     sampler: ViewSampler

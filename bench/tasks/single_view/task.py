@@ -287,7 +287,6 @@ def _infer_state(run: RunContext, model: SingleView, image: Float[Tensor, "4 hei
 
 
 def describe_training(training: dict[str, Any]) -> str:
-    """Text about a network's training and its validation error."""
     settings, validation = training["settings"], training["validation"]
     return (
         f"the network was trained on {settings['shapes']} shapes of {training['dataset']['name']}, "

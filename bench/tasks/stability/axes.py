@@ -109,7 +109,6 @@ class Stress:
         return self.measure == "fit" or self.scene in NETWORK_DISTORTIONS
 
     def trial_seed(self, level: float, repeat: int) -> int:
-        """The seed of trial number `repeat` at a level."""
         return crc32(f"{self.scene} {level:.6f} {repeat}".encode())
 
     def trial(self, renderer: Renderer, level: float, repeat: int, conditions: Conditions) -> Outcome:

@@ -142,7 +142,6 @@ class Hole:
     direction: Float[Tensor, "3"]
 
     def distance(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        """The distance from the axis."""
         return torch.linalg.vector_norm(
             torch.linalg.cross(points - self.start.to(points), self.direction.to(points).expand_as(points)), dim=-1
         )
@@ -226,11 +225,11 @@ def judge_fit(
     """
     check_field_gradient(renderer)
     fit, prior, device = conditions.fit, conditions.prior, conditions.device
-    assert prior is not None
     if name in FIT_SETTINGS:
         fit = replace(fit, **{FIT_SETTINGS[name]: severity})
     is_occluded = name == "occlusion"  # then the initial code is the true one, and only the position is unknown
-    code, initial = _draw_codes(prior, draw, 0.0 if is_occluded else fit.offset)
+    code = prior.codes[draw.integers(len(prior.codes))]
+    initial = (1 - (0.0 if is_occluded else fit.offset)) * code  # at an offset of 1 the mean shape
     true: Field = prior.decoder.at(code)
     if name in OF_BOTH or name in OF_TRUTH:
         true = (OF_BOTH | OF_TRUTH)[name](true, severity)
@@ -244,7 +243,9 @@ def judge_fit(
         true = modification.applied(true, unknown)
         observations = [_observe(true, camera) for camera in cameras]
     sides = _cameras(direction, fit.resolution, ALL_SIDES_DEGREES) if is_spread else []
-    points = _seen_points([_observe(true, camera) for camera in sides] or observations).to(device)
+    undisturbed = [_observe(true, camera) for camera in sides] or observations
+    visible = [each.camera.rays().at(each.camera.distance(each.depth))[each.mask] for each in undisturbed]
+    points = torch.cat(visible).to(device) if any(map(len, visible)) else torch.zeros(1, 3, device=device)
     if name in DISTURBANCES:
         observations = [DISTURBANCES[name](each, severity, draw) for each in observations]
     fitted = replace(prior, decoder=deepcopy(prior.decoder).to(device))
@@ -268,12 +269,6 @@ def judge_fit(
         _failure(history, error, conditions.criteria.surface_error),
         {"surface_error": error, "evaluations_per_ray": evaluations_per_ray},
     )
-
-
-def _draw_codes(prior: Prior, draw: np.random.Generator, offset: float) -> tuple[Tensor, Tensor]:
-    """A training code, and an initial code whose distance from it is `offset` times its length: 1 is the mean shape."""
-    code = prior.codes[draw.integers(len(prior.codes))]
-    return code, (1 - offset) * code
 
 
 def _cameras(direction: tuple[float, float], resolution: int, spread: float | None) -> list[Camera]:
@@ -328,13 +323,6 @@ def _modification(
         start = OCCLUDER_OFFSET * torch.tensor([np.cos(angle), np.sin(angle)]).float()
         return Occluder(middle, axes, severity * OCCLUDER_RADIUS), torch.zeros(2), start
     return None, torch.zeros(0), torch.zeros(0)
-
-
-def _seen_points(observations: list[Observation]) -> Float[Tensor, "n 3"]:
-    """The points of the true surface that undisturbed observations show; the origin if there are none."""
-    shown = [each.camera.rays().at(each.camera.distance(each.depth))[each.mask] for each in observations]
-    points = torch.cat(shown)
-    return points if len(points) else torch.zeros(1, 3)
 
 
 def _failure(history: History, error: float, max_error: float) -> Failure:

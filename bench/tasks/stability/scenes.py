@@ -222,15 +222,12 @@ def network_scene(name: str, network: Decoder | Published, codes: Float[Tensor, 
         field = changed.at(code)
         view = {"elevation": NETWORK_ELEVATION_DEGREES, "field_of_view": NETWORK_FIELD_OF_VIEW_DEGREES}
         camera = _draw_camera(draw, max(resolution // NETWORK_PICTURE_SHARE, 8), **view)
-        return StressCase(field if change is None else _changed_values(field, change, severity), camera, truth)
+        if change is not None:
+            return StressCase(Shape(lambda x: change(field(x), severity), field.kind, field.lipschitz), camera, truth)
+        return StressCase(field, camera, truth)
 
     test_points = points_in_sphere(INSIDE_TEST_POINTS).float()
     return scene
-
-
-def _changed_values(field: Field, change: Callable[[Tensor, float], Tensor], severity: float) -> Shape:
-    """The field with other values and the same surface."""
-    return Shape(lambda points: change(field(points), severity), field.kind, field.lipschitz)
 
 
 def _cube_view_scene(view: Callable[[float], dict[str, float]]) -> Scene:
@@ -289,7 +286,6 @@ def _cube_case(draw: np.random.Generator, resolution: int, **view: float) -> Str
 
 
 def _union_of_seven(make_solid: Callable[[int], Solid]) -> Solid:
-    """The union of seven solids, from their indices 0 to 6."""
     return reduce(or_, map(make_solid, range(7)))
 
 

@@ -52,8 +52,6 @@ class Solid:
         return Solid(self.field.rotate(rotation), lambda rays: self.spans(back(rays)))
 
     def moved(self, offset: analytic.Numbers) -> "Solid":
-        """The solid moved by `offset` [3]."""
-
         def back(rays: Rays) -> Rays:
             return Rays(rays.origins - torch.as_tensor(offset).to(rays.origins), rays.directions)
 
@@ -177,13 +175,9 @@ class ReferenceTruth:
 
     def trace(self, rays: Rays) -> FirstHit:
         """The first hits of flat rays [n]; without gradient."""
-        field = self.field if self.rounded is None else self._in_float32
+        field = self.field if self.rounded is None else lambda points: self.rounded(points.float()).double()
         rendering = reference.trace(field, rays, lipschitz=self.lipschitz, least_step=self.thinnest, radius=1.0)
         return FirstHit(rendering.distance, rendering.hit, rendering.status == Status.STARTED_INSIDE)
-
-    def _in_float32(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        assert self.rounded is not None
-        return self.rounded(points.float()).double()
 
 
 Truth = Solid | ReferenceTruth  # a field whose first hits are known

@@ -114,6 +114,8 @@ class Stability:
         levels = {"": breakdown.level, "_low": breakdown.low, "_high": breakdown.high}
         (mild, milds), (severe, severes) = trials.successes_at(0), trials.successes_at(1)
         failed = Counter(trial.outcome.failure for trial in trials.all)
+        at_mild = [trial.outcome.numbers for trial in trials.all if trial.level == 0]
+        costs = [numbers["evaluations_per_ray"] for numbers in at_mild if "evaluations_per_ray" in numbers]
         return {
             **{f"breakdown{end}": severity(x) if x is not None and 0 <= x <= 1 else None for end, x in levels.items()},
             **{f"level{end}": level for end, level in levels.items()},
@@ -124,7 +126,7 @@ class Stability:
             "mild_trials": milds,
             "severe_successes": severe,
             "severe_trials": severes,
-            "evaluations_per_ray": trials.median_cost(),
+            "evaluations_per_ray": float(np.median(costs)) if costs else None,
             **{f"failed_{kind.replace(' ', '_')}": failed[kind] for kind in Failure if kind and failed[kind]},
         }
 
@@ -171,9 +173,3 @@ class _Trials:
         numbers = {"level": last.level, "severity": last.severity, "success": last.outcome.success}
         failed = {"failure": str(last.outcome.failure), "message": last.outcome.message}
         return {"trial": len(self.all) - 1, **numbers, **failed, **last.outcome.numbers}
-
-    def median_cost(self) -> float | None:
-        """Median field evaluations per ray at the mild end."""
-        mild = [trial.outcome.numbers for trial in self.all if trial.level == 0]
-        costs = [numbers["evaluations_per_ray"] for numbers in mild if "evaluations_per_ray" in numbers]
-        return float(np.median(costs)) if costs else None

@@ -83,13 +83,15 @@ def read_depths(path: Path, remedy: str = FORMATS) -> Depths:
     if stored.squeeze().ndim != 2:
         raise BadInput(f"{path} must hold one number for a pixel, not an array of shape {list(stored.shape)}: {remedy}")
     stored = stored.squeeze()
-    if stored.dtype.kind != "f" and _is_stretched(stored):
+    different = np.unique(stored) if stored.dtype.kind != "f" else ()
+    if len(different) >= MIN_STRETCHED_VALUES and int(np.gcd.reduce(different)) in STRETCHED_BYTE_FACTORS:
         raise BadInput(f"{path} has numbers of 8 bits, stretched to 16, as a picture of depth: {remedy}")
     missing = missing_numbers(stored)
     numbers = stored.astype(np.float64)
-    missing |= _is_marker(numbers, (numbers < 0) & ~missing)
     negative = (numbers < 0) & ~missing
-    if negative.any():
+    if negative.any() and (numbers > 0).any() and np.ptp(numbers[negative]) == 0:  # a single number, such as -1
+        missing |= negative
+    elif negative.any():
         raise BadInput(
             f"{path} has negative depths, at {negative.sum()} pixels and down to {numbers[negative].min():.4g}: "
             "camera z is positive in front of the camera. If they are OpenGL's z, save minus these numbers"
@@ -128,22 +130,7 @@ def check_object_depths(depths: Float[np.ndarray, " pixels"], path: Path) -> Non
         )
 
 
-def _is_marker(
-    numbers: Float[np.ndarray, "height width"], negative: Bool[np.ndarray, "height width"]
-) -> Bool[np.ndarray, "height width"]:
-    """The negative numbers, if all are the same, such as -1, and others are positive; else none."""
-    is_single = negative.any() and (numbers > 0).any() and np.ptp(numbers[negative]) == 0
-    return negative if is_single else np.zeros_like(negative)
-
-
-def _is_stretched(stored: Shaped[np.ndarray, "height width"]) -> bool:
-    """Whether integers are numbers of 8 bits times a factor."""
-    values = np.unique(stored)
-    return len(values) >= MIN_STRETCHED_VALUES and int(np.gcd.reduce(values)) in STRETCHED_BYTE_FACTORS
-
-
 def _picture_numbers(path: Path, remedy: str) -> Shaped[np.ndarray, "height width"]:
-    """The numbers of an image that Pillow reads."""
     with open_image(path) as image:
         mode, numbers = image.mode, np.asarray(image)
     if mode not in DEPTH_MODES:

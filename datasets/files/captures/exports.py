@@ -4,7 +4,7 @@ The world of the written cameras is that of the photographs, whose object lies i
 """
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -86,11 +86,7 @@ def write_transforms(shots: Sequence[Shot], path: Path) -> None:
     path.write_text(json.dumps({"frames": frames}, indent=1))
 
 
-LAYOUTS: dict[str, Callable[[Sequence[Shot], Path, float], None]] = {
-    "idr": write_idr,
-    "dvr": write_dvr,
-    "pmo": write_pmo,
-}
+LAYOUTS = {"idr": write_idr, "dvr": write_dvr, "pmo": write_pmo}
 
 
 def _write_images(shots: Sequence[Shot], folder: Path) -> None:

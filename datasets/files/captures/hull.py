@@ -36,7 +36,6 @@ def _carve(shots: Sequence[Shot], points: Float[Tensor, "n 3"]) -> Float[Tensor,
     smallest, views = torch.ones_like(points[:, 0]), torch.zeros_like(points[:, 0])
     remaining = torch.arange(len(points), device=points.device)  # points inside of all masks so far
     for shot in shots:
-        assert shot.mask is not None
         pixels, depth = shot.camera.project(points[remaining])
         size = points.new_tensor([shot.camera.width, shot.camera.height])
         inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels <= size).all(-1)

@@ -67,5 +67,4 @@ def load_image(path: Path, *, upright: bool = False, white: int | None = None) -
 
 
 def has_alpha(image: Image.Image) -> bool:
-    """Whether an image has an alpha channel or a transparent colour."""
     return "A" in image.getbands() or "transparency" in image.info

@@ -166,5 +166,4 @@ def unpaired_note(what: str, names: Collection[str]) -> tuple[str, ...]:
 
 
 def _first_names(names: Collection[str]) -> str:
-    """The first names of a list, for a message."""
     return ", ".join([*names][:MAX_LISTED_NAMES]) + (", ..." if len(names) > MAX_LISTED_NAMES else "")

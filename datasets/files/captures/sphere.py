@@ -72,11 +72,7 @@ def likely_cause(shots: Sequence[Shot]) -> str:
     if white := [shot.name for shot in shots if shot.mask is not None and is_inverted(shot.mask.numpy())]:
         which = f"{len(white)} of the masks, such as that of {white[0]}, are"
         return f"{which} white along the border, as inverted ones: make the object white, and the rest black"
-    return _size_mismatch([shot.camera for shot in shots])
-
-
-def _size_mismatch(cameras: Sequence[Camera]) -> str:
-    """A message about cameras whose principal point fits images of another size; "" for other cameras."""
+    cameras = [shot.camera for shot in shots]
     centres = [(camera.intrinsics[0, 2] / camera.width, camera.intrinsics[1, 2] / camera.height) for camera in cameras]
     across, down = 2 * np.median(np.array(centres), axis=0)
     if min(across, down) <= 0 or abs(across / down - 1) > ASPECT_TOLERANCE or max(across, 1 / across) < MIN_SIZE_RATIO:
@@ -108,7 +104,9 @@ def viewed_sphere(shots: Sequence[Shot], depth_ranges: Sequence[tuple[float, flo
             radius = max(_visible_radius(shots, centre), float(np.median(far - near)) / 2)
             return Sphere(centre, radius, "about the middle of the depths that the format states")
     elif spread < PARALLEL_SPREAD and all(shot.mask is not None for shot in shots):
-        centre, _ = nearest_to_lines(poses[:, :3, 3], np.stack([_mask_direction(shot) for shot in shots]))
+        means = [shot.camera.rays().directions[shot.mask].mean(dim=0) for shot in shots]  # to the masks' middles
+        directions = [torch.nn.functional.normalize(mean, dim=0).double().numpy() for mean in means]
+        centre, _ = nearest_to_lines(poses[:, :3, 3], np.stack(directions))
     elif spread < PARALLEL_SPREAD:
         raise BadInput(
             f"the cameras look in parallel ({np.degrees(spread**0.5):.2g} degrees apart), so that nothing says how far "
@@ -131,12 +129,6 @@ def nearest_to_lines(
     projected = np.sum([matrix @ point for matrix, point in zip(projections, positions, strict=True)], axis=0)
     centre = np.linalg.lstsq(np.sum(projections, axis=0), projected, rcond=None)[0]
     return centre, max(float(np.linalg.eigvalsh(np.mean(projections, axis=0))[0]), 0.0)
-
-
-def _mask_direction(shot: Shot) -> Float[np.ndarray, "3"]:
-    """The direction to the middle of a mask, in world axes."""
-    assert shot.mask is not None
-    return torch.nn.functional.normalize(shot.camera.rays().directions[shot.mask].mean(dim=0), dim=0).double().numpy()
 
 
 def _visible_radius(shots: Sequence[Shot], centre: Float[np.ndarray, "3"]) -> float:

@@ -83,16 +83,13 @@ def _read_shot(frame: Frame, longest: int, white: int | None = None) -> tuple[Sh
     except ValueError as error:
         raise BadInput(f"the camera of {frame.image}: {error}") from None
     mask = None if opacity is None else torch.from_numpy(opacity[..., 0] > 0.5)
-    covered = None if opacity is None else torch.from_numpy(_relative_to_peak(opacity[..., 0]))
+    covered = None
+    if opacity is not None:  # relative to its maximum, or to 0.5 if that is smaller: some masks have a darker white
+        covered = torch.from_numpy(np.ascontiguousarray(opacity[..., 0] / max(float(opacity[..., 0].max()), 0.5)))
     if frame.depth is not None and depth is not None and mask is not None:
         check_object_depths(depth[mask & (depth > 0)].double().numpy(), frame.depth[0])
     stored = torch.from_numpy(np.ascontiguousarray(colours))
     return Shot(frame.image.name, camera, stored, mask, depth, covered=covered), missing
-
-
-def _relative_to_peak(opacity: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Opacity over its maximum, or over 0.5 if that is smaller: some masks have a darker white."""
-    return np.ascontiguousarray(opacity / max(float(opacity.max()), 0.5))
 
 
 def exif_notes(frames: Sequence[Frame]) -> tuple[str, ...]:

@@ -160,7 +160,7 @@ class Scene:
             content = self._rows(image, view["byteLength"], np.dtype("u1"), 1).tobytes()
         else:
             uri = image["uri"]
-            content = _decode_data_uri(uri) if uri.startswith("data:") else Path(unquote(uri))
+            content = base64.b64decode(uri.partition(",")[2]) if uri.startswith("data:") else Path(unquote(uri))
         return Material("", WHITE, content)
 
     def _colours(self, primitive: dict[str, Any], count: int) -> Float[np.ndarray, "v 3"] | None:
@@ -249,7 +249,7 @@ class Scene:
     def _buffer(self, i: int) -> bytes:
         uri = self.stored["buffers"][i].get("uri", "")
         if uri.startswith("data:"):
-            return _decode_data_uri(uri)
+            return base64.b64decode(uri.partition(",")[2])
         if i == 0 and not uri:
             return self.binary
         raise BadInput(f"must hold its numbers, but buffer {i} is elsewhere, '{uri[:40]}' {self._extensions}")
@@ -266,10 +266,6 @@ def _base_colour(material: dict[str, Any]) -> tuple[list[float] | None, dict[str
     base = material.get("pbrMetallicRoughness", {})
     factor = older.get("diffuseFactor", base.get("baseColorFactor"))
     return factor, older.get("diffuseTexture", base.get("baseColorTexture"))
-
-
-def _decode_data_uri(uri: str) -> bytes:
-    return base64.b64decode(uri.partition(",")[2])
 
 
 def _matrix(node: dict[str, Any]) -> Float[np.ndarray, "*n 4 4"]:

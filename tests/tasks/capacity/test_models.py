@@ -204,9 +204,8 @@ def test_held_out_rays_are_not_fitted():
     assert split.fitted.observed.sum() == pytest.approx(0.75 * observed.sum(), abs=1)
     assert box((0.5, 0.3, 0.4))(split.points).abs().max() < 0.01
     assert (box((0.5, 0.3, 0.4))(split.free) > -0.01).all()
-    assert (
-        len(split.free) > 1.5 * FREE_POINTS_PER_RAY * split.fitted.observed.sum()
-    )  # background rays have free points too
+    # Background rays have free points too.
+    assert len(split.free) > 1.5 * FREE_POINTS_PER_RAY * split.fitted.observed.sum()
     first, again, other = (split.terms(sphere(0.4), iteration, 1.0) for iteration in (0, 0, 1))
     assert first == again != other
 

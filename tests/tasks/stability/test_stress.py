@@ -236,9 +236,7 @@ def test_a_severity_may_be_a_setting_of_the_renderer():
     assert stress_named("few_steps").stressed(load("renderer", "idr"), 0.3).steps == 1  # 0 is invalid
     with pytest.raises(Unsupported, match="DVR has no epsilon, or it is null: choose another"):
         epsilon.stressed(load("renderer", "dvr"), 0.01)
-    with pytest.raises(
-        Unsupported, match="Naive has no n_gradient_samples, or it is null"
-    ):  # the gradient of naive is unrolled
+    with pytest.raises(Unsupported, match="Naive has no n_gradient_samples, or it is null"):  # it is unrolled
         stress_named("gradient_samples").stressed(load("renderer", "naive"), 3.0)
     practical = load("renderer", "naive", gradient="practical", n_gradient_samples=1)
     assert stress_named("gradient_samples").stressed(practical, 2.6).n_gradient_samples == 3

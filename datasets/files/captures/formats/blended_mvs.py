@@ -35,10 +35,4 @@ def _mvs_frame(file: Path, image: Path, mask: Path | None) -> Frame:
     return Frame(image, intrinsics.reshape(3, 3), world_to_camera, mask, depth_range=(near, far))
 
 
-FORMAT = Format(
-    "BlendedMVS",
-    60,
-    ("cams/*_cam.txt",),
-    "cams/*_cam.txt (BlendedMVS)",
-    read_layout,
-)
+FORMAT = Format("BlendedMVS", 60, ("cams/*_cam.txt",), "cams/*_cam.txt (BlendedMVS)", read_layout)

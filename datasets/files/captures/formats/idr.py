@@ -39,7 +39,9 @@ def read_layout(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     scale, notes = _scale(cameras, count, str(file))
     masks, mask_notes = find_masks(folder, images if masked else {}, sorted_too=True)
     is_dvr = _is_dvr(cameras)
-    depths = _depths(folder, images) if is_dvr else {}
+    files_of_depths = {path.name: path for path in sorted(folder.glob("depth/*.exr")) if not path.name.startswith(".")}
+    pairs = pair_by_name(images, files_of_depths) if is_dvr else {}
+    depths = {name: files_of_depths[depth] for name, depth in pairs.items()}
 
     def frame(i: int, name: str) -> Frame:
         world = cameras[f"world_mat_{i}"]
@@ -60,12 +62,6 @@ def _is_dvr(cameras: Matrices) -> bool:
         return False
     lengths = np.linalg.norm(cameras["world_mat_0"][:3, :3], axis=1)
     return bool(lengths.max() <= 1.01 * lengths.min())
-
-
-def _depths(folder: Path, images: dict[str, Path]) -> dict[str, Path]:
-    """The depth files, by the names of their images."""
-    stored = {path.name: path for path in sorted(folder.glob("depth/*.exr")) if not path.name.startswith(".")}
-    return {name: stored[depth] for name, depth in pair_by_name(images, stored).items()}
 
 
 def _dvr_frame(projection: Float[np.ndarray, "4 4"], image: Path, mask: Path | None, depth: Path | None) -> Frame:

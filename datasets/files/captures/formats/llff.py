@@ -32,10 +32,4 @@ def read_layout(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     return Layout("LLFF", frames, None, (*notes, *mask_notes), example_image="images/*")
 
 
-FORMAT = Format(
-    "LLFF",
-    40,
-    ("poses_bounds.npy",),
-    "poses_bounds.npy with images/ (LLFF)",
-    read_layout,
-)
+FORMAT = Format("LLFF", 40, ("poses_bounds.npy",), "poses_bounds.npy with images/ (LLFF)", read_layout)

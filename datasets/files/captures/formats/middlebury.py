@@ -33,10 +33,4 @@ def read_layout(folder: Path, files: Sequence[Path], masked: bool) -> Layout:
     return Layout("Middlebury", frames, None, notes, example_image=next(iter(cameras), ""))
 
 
-FORMAT = Format(
-    "Middlebury",
-    30,
-    ("*_par.txt",),
-    "*_par.txt (Middlebury)",
-    read_layout,
-)
+FORMAT = Format("Middlebury", 30, ("*_par.txt",), "*_par.txt (Middlebury)", read_layout)
