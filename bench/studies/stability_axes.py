@@ -23,7 +23,7 @@ AXES_NOTES = (
     "the distance, and the kinds of failed trials.",
     breakdowns.SUCCESS,
 )
-MIN_CORRELATED = 5  # renderers: with fewer, no correlation is significant
+MIN_CORRELATED = 7  # renderers: with fewer, the p value is too small
 COST_NOTES = (
     "An axis is a kind of stress. The axes are those of renderings, without settings that some renderer lacks. Rank 1 "
     "is the best, and equal breakdowns share their mean rank. A failed or missing run has the worst rank, and so has a "
@@ -102,7 +102,7 @@ def make_cost(runs: Runs) -> Result:
         question="Do robust renderers cost more field evaluations?",
         verdict=f"{_related(lines['cost'], means)} {ends} {_alike(ranks)}".strip(),
         n=f"{shared['axis'].nunique()} axes and {len(lines)} renderers",
-        remarks=COST_NOTES,
+        remarks=[*COST_NOTES, _power((lines["cost"].notna() & means.notna()).sum())],
         columns=COST_COLUMNS,
         lines=lines.to_dict("records"),
         figure=chart.draw([panel], 3.6),
@@ -145,6 +145,14 @@ def _related(costs: pd.Series, ranks: pd.Series) -> str:
         return ""
     answer = "No significant correlation" if p >= statistics.ALPHA else "Yes" if rho < 0 else "No, they cost fewer"
     return f"{answer}: Spearman's correlation of rank and cost is *{rho:.2f}* (p = {p:.2g}, {both.sum()} renderers)."
+
+
+def _power(count: int) -> str:
+    """A sentence on the correlations that could be significant; empty with few renderers."""
+    if count < MIN_CORRELATED:
+        return ""
+    smallest = statistics.smallest_significant_correlation(count)
+    return f"With {count} renderers, only correlations beyond ±{smallest:.2f} are significant."
 
 
 def _alike(ranks: dict[str, statistics.Interval]) -> str:

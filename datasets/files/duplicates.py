@@ -105,5 +105,8 @@ def write_cached(entry: Path, write: Callable[[Path], None]) -> None:
     with suppress(OSError):
         entry.parent.mkdir(parents=True, exist_ok=True)
         scratch = entry.with_name(f"{os.getpid()}.{entry.name}")
-        write(scratch)
-        scratch.replace(entry)
+        try:
+            write(scratch)
+            scratch.replace(entry)
+        finally:
+            scratch.unlink(missing_ok=True)

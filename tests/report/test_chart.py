@@ -60,6 +60,14 @@ def test_many_lines_have_bars_next_to_each_other(positions):
     assert bars[-1, 0] < 1.2 and [line.get_xdata().tolist() for line in axis.lines] == bars.tolist()
 
 
+@pytest.mark.parametrize("positions", [[1], [1, 1.05, 100], [1, 2, math.inf]], ids=["one", "close", "infinite"])
+def test_bars_do_not_reach_the_next_position(positions):
+    known = [Interval(2.0, 1.0, 4.0)] * len(positions)
+    axis = axis_of(*(curve(name, "dist", positions, known) for name in "abcdefgh"))
+    drawn = np.array([line.get_xdata() for line in axis.lines]).T  # [position, line]
+    assert np.isfinite(drawn).all() and (np.diff(drawn[:2].flatten()) > 0).all()
+
+
 def test_without_an_interval_the_points_of_the_shapes_are_drawn():
     made = series("a", "dist", [7], FEW)
     assert "low" not in made and made["shapes"] == [[7, 1], [7, 3]]

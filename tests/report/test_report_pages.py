@@ -10,6 +10,7 @@ import pytest
 
 import bench.studies
 from bench.records.read import read_records
+from bench.report.data.records import Row, base_renderer, row_of
 from bench.report.data.runs import Selection, choose
 from bench.report.write import html, paper, table
 from bench.report.write.caption import SMOKE_WARNING
@@ -33,6 +34,38 @@ def make(runs):
 
 PAGES = {{"mine": make, "mine_again": make}}
 """
+
+
+def record(**changed) -> dict:
+    """The parts of a record of which its row is made."""
+    return {"renderer": "dist", "method": "", "dataset": "car", "config": {}, **changed}
+
+
+@each(
+    "changed, preset, name",
+    [
+        ({"renderer": "dist_aggressive"}, "dist_aggressive", "dist_aggressive"),
+        ({"renderer": "dist_capped", "config": {"renderer": {"_label_": "capped"}}}, "dist_capped", "capped"),
+        ({"config": {"label": "mine", "renderer": {"_label_": "DIST"}}}, "dist", "mine"),
+        ({"method": "dist_mask", "config": {"label": "DIST with mask"}}, "dist_mask", "DIST with mask"),
+        ({"method": "pose_icp_plane"}, "pose_icp_plane", "dist"),
+    ],
+)
+def test_a_row_is_its_preset_under_a_name(changed, preset, name):
+    assert row_of(record(**changed)) == Row(preset, name)
+
+
+@each(
+    "renderer, target, base",
+    [
+        ("dist_aggressive", "renderers.DIST", "dist"),
+        ("dvr", "renderers.DVR", "dvr"),
+        ("mine", "mypkg.rendering.Mine", "mine"),
+        ("naive", None, "naive"),
+    ],
+)
+def test_the_base_of_a_preset_is_its_class_or_a_users_preset(renderer, target, base):
+    assert base_renderer(record(renderer=renderer, config={"renderer": {"_target_": target}})) == base
 
 
 def test_two_presets_under_one_label_are_two_rows(tmp_path):
@@ -192,8 +225,11 @@ def test_a_verdict_of_scale_smoke_is_that_nothing_follows(tmp_path):
         write_run(tmp_path, "table1", label, metrics=costs(), settings={"scale": {"name": "smoke"}})
     write_paper(read_records(tmp_path)[0], tmp_path)
     shown = read_shown(tmp_path / "paper" / "table1.json")
-    assert shown.verdict == SMOKE_WARNING and shown.question.endswith("?")
-    assert shown.experiments == ["table1", "table1_large"]
+    assert (
+        shown.verdict == SMOKE_WARNING
+        and shown.question.endswith("?")
+        and shown.experiments == ["table1", "table1_large"]
+    )
 
 
 @each("text", ["", "[1]", '{"verdict": 1, "chart": []}', "[" * 100_000])

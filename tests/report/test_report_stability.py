@@ -1,5 +1,6 @@
 """The stability atlas as tables and figures, made from run folders whose numbers are known."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -117,6 +118,18 @@ def test_a_cell_has_the_command_of_a_ray_and_the_levels_around_the_breakdown(tmp
     assert dist["ray"] == {"command": command, "breaks": 0.5, "works": 0.4}
     assert (dvr["ray"]["breaks"], dvr["ray"]["works"]) == (None, 1.0)  # it does not break
     assert [cell["ray"] for line in others for cell in line if cell] == [None, None]
+
+
+def test_a_cell_has_the_pictures_of_its_own_run(tmp_path):
+    for label, level in (("DIST", 0.45), ("DVR", 0.8), ("IDR", 0.2)):
+        file = broke(tmp_path, "wires", label, level) / "record.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"pictures": {"breaks_text": f"fails at {level}"}}))
+    page = page_of(tmp_path, "stability")
+    texts = {
+        row: cell["pictures"]["breaks_text"]
+        for row, cell in zip(page.atlas["rows"], page.atlas["cells"][0], strict=True)
+    }
+    assert texts == {"DIST": "fails at 0.45", "DVR": "fails at 0.8", "IDR": "fails at 0.2"}
 
 
 def test_a_shipped_row_has_the_ends_of_the_sweep_at_which_all_trials_agree():

@@ -57,6 +57,21 @@ def table(results: Path, name: str = "completion-1") -> pd.DataFrame:
     return pd.read_csv(results / "sweeps" / name / "table.csv").set_index("row")
 
 
+def test_rows_are_what_varies_beside_shapes_and_seeds(tmp_path):
+    cells = [cell(r, dataset=d, seed=s) for r in ("dist", "dvr") for d in ("sofa", "plane") for s in (0, 1)]
+    swept(tmp_path, cells)
+    for number, one in enumerate(cells):
+        ran(tmp_path, one, 0.001 * (number + 1))
+    found = table(tmp_path)
+    assert list(found.index) == ["DIST", "DVR"]
+    assert list(found["chamfer_l2"]) == pytest.approx([0.0025, 0.0065])
+    assert list(found["runs"]) == [4, 4] and list(found["failed"]) == [0, 0]
+    assert found.loc["DVR", "ratio"] == pytest.approx((5.5 * 7.5 / (1.5 * 3.5)) ** 0.5)  # of medians over seeds
+    assert math.isnan(found.loc["DIST", "ratio"])
+    assert list(found["loop_seconds"]) == [30, 30] and list(found["value_evaluations"]) == [1.43e6] * 2
+    assert found["chamfer_l2_low"].isna().all()  # two shapes give no interval
+
+
 def test_one_failed_seed_of_three_leaves_the_ratio_of_its_shape_finite(tmp_path):
     cells = [cell(renderer, seed=seed) for renderer in ("dist", "dvr") for seed in (0, 1, 2)]
     swept(tmp_path, cells)
@@ -84,8 +99,10 @@ def test_each_data_set_has_a_column_and_a_panel_with_the_best_in_bold_and_n_once
     assert [row[:4] for row in shown.rows] == [["DIST", "1.00", "4.00", "2.50"], ["DVR", "3.00", "2.00", "3.00"]]
     assert [at for at in shown.best if at[1] < 4] == [[0, 1], [1, 2], [0, 3]]
     assert shown.question == "Which has the lowest Chamfer?"
-    assert shown.verdict.startswith("Median Chamfer (x1000): *2.50* (DIST) to 3.00 (DVR); n = 3 shapes. ")
-    assert "Best by data set: sofa DIST, plane DVR. " in shown.verdict and "different shapes" in shown.verdict
+    assert shown.verdict == (
+        "Median Chamfer (x1000): *2.50* (DIST) to 3.00 (DVR); n = 3 shapes. Best by data set: sofa DIST, plane DVR. "
+        "The rows have different shapes, so their medians do not compare."
+    )
     assert "n = 5 runs (3 shapes, 1 seed); fewer than six shapes: no interval." in shown.caption
     panels = shown.chart["panels"]
     assert [panel["title"] for panel in panels] == ["sofa", "sofa", "plane", "plane"]

@@ -22,6 +22,7 @@ from bench.report.data.statistics import (
     shapes_needed,
     shapes_won,
     share,
+    smallest_significant_correlation,
     tied_with_best,
     typical,
 )
@@ -231,6 +232,18 @@ def point(costs, errors) -> tuple:
     return singles(*costs), singles(*errors)
 
 
+def test_front_of_certain_cases():
+    ones = (1, 1, 1, 1, 1)
+    points = [
+        point(ones, (1, 20, 300, 4000, 50000)),
+        point(ones, (1.1, 22, 330, 4400, 55000)),  # worse on every shape, though shapes differ far more
+        point((2, 2, 2, 2, 2), (0.5, 10, 150, 2000, 25000)),
+        point((0.1, 0.1, 0.1, 0.1, 0.1), (INF, INF, INF, INF, INF)),
+        point((INF, INF, INF, INF, INF), (0.1, 0.1, 0.1, 0.1, 0.1)),
+    ]
+    assert front(points, seed=0) == [1, 0, 1, 0, 0]
+
+
 def test_front_of_uncertain_cases():
     # The first one's median of three draws is 1, not 3, if two or three of them are of two shapes of three: 20 of 27.
     chances = front([point((1, 1, 1), (1, 1, 3)), point((1, 1, 1), (2, 2, 2))], seed=0, draws=8000)
@@ -286,8 +299,9 @@ def test_shapes_with_equal_errors_are_no_trials_of_the_sign_test():
     ones = [np.array([1.0])] * 12
     lower, tied = ratio([np.array([0.5])] * 6 + ones[6:], ones), ratio(ones, ones)
     assert ratio_verdicts([lower]) == [Verdict.DIFFERS]  # 6 of 6 trials: p = 2 / 64 = .031
-    # Above .05 / 2; of 12 trials p would be .0005.
-    assert ratio_verdicts([lower, lower]) == [Verdict.NOT_DISTINGUISHED] * 2
+    assert (
+        ratio_verdicts([lower, lower]) == [Verdict.NOT_DISTINGUISHED] * 2
+    )  # above .05 / 2; of 12 trials p would be .0005
     assert ratio_verdicts([tied]) == [Verdict.NOT_DISTINGUISHED]
 
 
@@ -324,5 +338,8 @@ def test_the_rank_correlation_is_spearman_s():
         second = first + draw.integers(0, 9, n)
         expected = stats.spearmanr(first, second)
         assert rank_correlation(first, second) == pytest.approx((expected.statistic, expected.pvalue))
-    assert rank_correlation([1, 2, 3, 4], [9, 5, 4, 1]) == (-1, 0)
+    assert rank_correlation([1, 2, 3, 4], [9, 5, 4, 1])[0] == -1
+    smallest = smallest_significant_correlation(12)
+    p_values = [2 * stats.t.sf(r * np.sqrt(10 / (1 - r**2)), 10) for r in (smallest - 1e-6, smallest + 1e-6)]
+    assert p_values[0] > 0.05 > p_values[1]
     assert math.isnan(rank_correlation([1, 1, 1], [1, 2, 3])[0])

@@ -278,6 +278,13 @@ def test_the_block_of_pixels_divides_the_rays(scene, tmp_path):
     assert sampled.rays_per_iteration in (4, 12, 48) and sampled.counts.cost == 0
 
 
+def test_trials_need_a_number_of_iterations(scene, tmp_path):
+    spending = replace(SETTINGS, optimiser=replace(SETTINGS.optimiser, budget=2e4, ends="budget"))
+    spending.check(run_in(tmp_path, scene, field="network_2x16").inputs)
+    with pytest.raises(BadInput, match=r"field=auto.*: remove task\.optimiser\.ends=budget, or name a field"):
+        spending.check(run_in(tmp_path, scene, field="auto").inputs)
+
+
 @each("masks", [255, 250, None])
 def test_several_rays_of_each_pixel_are_drawn_anew_and_compared_with_fractions(scene, tmp_path, masks):
     """Of a scene, and of photographs on disk, also if the white of their masks is darker."""

@@ -250,6 +250,12 @@ def rank_correlation(first: Values, second: Values) -> tuple[float, float]:
     return rho, 2 * float(special.stdtr(freedom, -t)) if freedom > 0 else math.nan
 
 
+def smallest_significant_correlation(n: int) -> float:
+    """The smallest absolute `rank_correlation` of n values that is significant."""
+    t = float(special.stdtrit(n - 2, 1 - ALPHA / 2))
+    return t / math.sqrt(n - 2 + t**2)
+
+
 def tied_with_best(ranks: dict[Any, Interval], best: Any) -> list[Any]:
     """The other methods that cannot be distinguished from the best: the interval of the rank difference contains 0."""
     best_points = np.array(ranks[best].points)

@@ -146,7 +146,9 @@ def _side_by_side(all_series: Sequence[Series], *, log: bool) -> list[Series]:
     """The series, moved along x so that their bars do not overlap."""
     forward, back = (np.log, np.exp) if log else (np.asarray, np.asarray)
     positions = [forward(each["x"]) for each in all_series]
-    step = BAR_STEP * np.ptp(np.concatenate(positions))
+    places = np.unique(np.concatenate([x[np.isfinite(x)] for x in positions]))
+    width, gap = (np.ptp(places), np.diff(places).min()) if len(places) > 1 else (1.0, 1.0)
+    step = min(BAR_STEP * width, 0.8 * gap / len(all_series))
     middle = (len(all_series) - 1) / 2
     moved = [back(x + (index - middle) * step) for index, x in enumerate(positions)]
     return [each | {"x": x} for each, x in zip(all_series, moved, strict=True)]

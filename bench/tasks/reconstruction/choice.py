@@ -137,9 +137,10 @@ class AutoField:
         fitted = tuple(shot for index, shot in enumerate(subject.input_shots) if index % VALIDATION_STEP)
         trial_subject = replace(subject, input_shots=fitted)
         pixels = Stack.build(validation, None, device).pixels
-        iterations, budget = max(round(self.trial * settings.iterations), MIN_TRIAL_ITERATIONS), settings.budget
+        iterations = max(round(self.trial * settings.iterations), MIN_TRIAL_ITERATIONS)
         iterations = min(iterations, settings.iterations)
-        trial_settings = replace(settings, iterations=iterations, budget=budget and self.trial * budget)
+        budget = settings.budget and settings.budget * iterations / settings.iterations
+        trial_settings = replace(settings, iterations=iterations, budget=budget)
 
         def trial(name: str, trials: Trials) -> Evidence:
             torch.manual_seed(run.inputs.seed)  # each trial starts as it would alone
@@ -160,7 +161,7 @@ class AutoField:
             evidence.evaluations = history.counts.value
             if history.status is RunStatus.OK:
                 evidence.error = error()
-                evidence.falling = any(
+                evidence.falling = all(  # also after a budget that ended the trial in its first half
                     half.mean - evidence.mean > evidence.error.noise_of_difference(half) for half in halfway
                 )
             return evidence
@@ -195,7 +196,7 @@ class Choice:
         values = sum(trial.evaluations for trial in self.trials.tried)
         text = f"field=auto: {self.kept.candidate}, {self.kept.size.free:,} numbers"
         if self.kept.error is None:
-            text += ", though no trial ended well: lower task.optimiser.learning_rate"
+            text += ", though no trial ended well: lower task.optimiser.learning_rate, or raise a task.optimiser.budget"
         photographs = f"{plural(self.validation_count, 'photograph')} set aside"
         spent = f"the trials took {self.seconds:.1f} s and {values:,} values"
         return f"{text}; error of colours on {photographs}, after the trials: {errors}; {spent}"

@@ -9,7 +9,7 @@ import torch
 from bench.config import AUTO
 from bench.evaluate.state import State
 from bench.setup.inputs import RunContext, RunInputs
-from bench.solve.optimise import OptimiserSettings, with_affordable_rays
+from bench.solve.optimise import BUDGET, OptimiserSettings, with_affordable_rays
 from bench.solve.solve import check_field_gradient, solve_and_draw
 from bench.tasks.reconstruction import background as behind
 from bench.tasks.reconstruction import cameras
@@ -29,7 +29,7 @@ from bench.tasks.reconstruction.subject import (
     given_distances,
     hull_distances,
 )
-from renderers.checks import check_at_least, check_choice
+from renderers.checks import BadInput, check_at_least, check_choice
 from renderers.field import Field
 from renderers.rendering import Unsupported, check_kind
 
@@ -101,7 +101,10 @@ class Reconstruction(PhotographTask):
             raise ValueError(f"task.rays must be a multiple of 4 for patches of 2 x 2 pixels, not {self.rays}: 1024")
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput for several rays per pixel with observations of single rays."""
+        """Raises BadInput for several rays per pixel with observations of single rays, and for trials without end."""
+        if inputs.field.name == AUTO and self.optimiser.ends == BUDGET:
+            reason = "field=auto tries each field for a fraction of the iterations, which a budget does not set"
+            raise BadInput(f"{reason}: remove task.optimiser.ends=budget, or name a field, such as field=network_4x128")
         if inputs.views.rays_per_pixel > 1:
             self.losses.check_rays_per_pixel(depths=self.depths.points != NONE)
 

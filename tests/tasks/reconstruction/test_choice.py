@@ -103,6 +103,16 @@ def test_trials_are_long_enough_to_show_an_order(tmp_path, iterations, trial):
     assert len(problem.calls) == 1 + trial
 
 
+def test_a_trial_has_its_share_of_a_budget_also_if_it_is_lengthened(tmp_path):
+    problem = FixedError(3, 0.3, falls=-1.0)  # its error rises
+    settings = OptimiserSettings(160, 0.1, "constant", budget=160 * 10)  # a loss costs 10
+    chosen({"a": problem}, tmp_path, settings=settings)
+    assert len(problem.calls) in (80, 81)
+    stopped = replace(settings, budget=400)  # before half of the trial
+    choice, _ = chosen({"a": FixedError(3, 0.3)}, tmp_path, settings=stopped)
+    assert choice.trials.tried[0].falling
+
+
 def test_candidates_that_are_no_better_are_skipped_until_patience_ends(tmp_path):
     problems = {"a": FixedError(1, 0.3), "b": FixedError(2, 0.4), "c": FixedError(3, 0.4), "d": FixedError(4, 0.1)}
     assert chosen(problems, tmp_path, patience=3)[0].kept.candidate == "d"

@@ -89,7 +89,7 @@
       element("img", {src: pictures[name], alt: `Errors of a rendering that ${pictures[`${name}_text`]}`}),
       element("figcaption", null, pictures[`${name}_text`])));
     if (!figures.length) return null;
-    return [element("div.thumbnails", null, figures), element("p", null, soft("Grey: right hits. Red: missed. Blue: spurious. Orange: another surface."))];
+    return [element("div.thumbnails", null, figures), element("p", null, soft("Grey: right hits. Red: missed. Blue: spurious. Orange: another surface, or not a number. A pixel shows the worst of 2 × 2 if the rendering has more than 64 per side."))];
   }
 
   /* The commands that draw the ray of the most wrong pixel, where the renderer breaks and where it does not. */
@@ -107,7 +107,7 @@
 
   function large({pictures}) {
     const result = pictures.find(([name]) => name === "failure.png");
-    if (!result) return soft("This run has no picture of its breakdown: fits and gradients have none.");
+    if (!result) return soft("This run has no picture of its breakdown.");
     const [, src, alt] = result;
     return element("figure", null, element("img.figure", {src, alt}), element("figcaption", null, alt));
   }
