@@ -78,7 +78,7 @@ def weights(layers: int, width: int, code_length: int, skip: int, *, narrow: boo
 
 
 def _verdict(lines: list[Line]) -> str:
-    """The significant ratios of a renderer's errors, and its cheapest prior without a significantly larger error."""
+    """The significant ratios of a renderer's errors, and its smallest prior without a significantly larger error."""
     largest = lines[-1]
     ratios = [(line["row"], compare.ratio_of(line["ratio"])) for line in lines]
     text = compare.differing(ratios, f"of errors, to {largest['row']},")
@@ -89,21 +89,17 @@ def _verdict(lines: list[Line]) -> str:
         for (_, ratio), verdict in zip(tested, verdicts, strict=True)
     ]
     similar = [line for (line, _), larger in zip(tested, is_larger, strict=True) if not larger]
-    candidates = [line for line in (*similar, largest) if line["flops"]]
+    candidates = [line for line in (*similar, largest) if line["flops"]]  # with a run that ended ok
     if not tested or statistics.Verdict.NOT_DECIDABLE in verdicts or largest not in candidates:
         return text
-    cheapest = min(candidates, key=lambda line: line["flops"])
-    if cheapest is largest:
-        return f"{text} Every prior with fewer FLOPs has a significantly larger error."
-    share, error = table.percent(cheapest["flops"] / largest["flops"]), format.number(cheapest["ratio"].ratio.value)
-    return (
-        f"{text} Without a significantly larger error, {cheapest['row']} needs the fewest FLOPs: {share} of those of "
-        f"the largest, with {error} times the error."
-    )
+    smallest = min(candidates, key=lambda line: line["weights"])
+    if smallest is largest:
+        return f"{text} Every smaller prior has a significantly larger error."
+    return f"{text} Without a significantly larger error, {smallest['row']} is the smallest."
 
 
 def _panels(pooled: list[Line]) -> list[chart.Panel]:
-    several = len(_presets(pooled)) > 1
+    several, codes = len(_presets(pooled)) > 1, sorted({line["code"] for line in pooled})
     panels = []
     for key, title in (("error", compare.LABEL), ("flops", "FLOPs of a run")):
         curves = []
@@ -111,11 +107,11 @@ def _panels(pooled: list[Line]) -> list[chart.Panel]:
         for colour, (network, preset) in zip(cycle(COLOURS), groups, strict=False):
             lines = [line for line in pooled if (line["network"], line["preset"]) == (network, preset)]
             lines = [line for line in lines if line["flops"]]
-            x, y = ([line[name] for line in lines] for name in ("code", key))
+            x, y = [codes.index(line["code"]) for line in lines], [line[key] for line in lines]
             texts = [f"{line['weights']:,} weights" for line in lines]
             name = f"network {network}{f', {preset}' if several else ''}"
             curves.append(chart.curve(name, "", x, y, text=texts) | {"colour": colour, "symbol": "o"})
-        panels.append(chart.panel_data("", "numbers of the code", title, curves))
+        panels.append(chart.panel_data("", "numbers of the code", title, curves, ticks=[*map(str, codes)]))
     return panels
 
 

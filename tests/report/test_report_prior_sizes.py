@@ -19,20 +19,25 @@ def test_weights_are_those_of_the_network(skip, narrow):
     assert weights(**network) == sum(parameter.numel() for parameter in Decoder(**network).parameters())
 
 
-def line(row: str, errors: list[float], flops: float) -> dict:
+def line(row: str, errors: list[float], weights: int) -> dict:
     largest = [np.array([1.0])] * len(errors)
-    return {"row": row, "flops": flops, "ratio": Gap(ratio([np.array([e]) for e in errors], largest), 0, len(errors))}
+    return {
+        "row": row,
+        "flops": 1.0,
+        "weights": weights,
+        "ratio": Gap(ratio([np.array([e]) for e in errors], largest), 0, len(errors)),
+    }
 
 
-@each("small, middle_flops, words", [
-    (WORSE, 50.0, "middle needs the fewest FLOPs: 50 %"), (ALIKE, 50.0, "small needs the fewest FLOPs: 10 %"),
-    (BETTER, 50.0, "small needs the fewest FLOPs: 10 %"), (WORSE, 130.0, "Every prior with fewer FLOPs has a"),
+@each("small, middle, words", [
+    (WORSE, ALIKE, "middle is the smallest"), (ALIKE, ALIKE, "small is the smallest"),
+    (BETTER, ALIKE, "small is the smallest"), (WORSE, WORSE, "Every smaller prior has a significantly larger error"),
 ])  # fmt: skip
-def test_the_verdict_names_the_cheapest_prior_without_a_larger_error(small, middle_flops, words):
-    largest = {"row": "large", "flops": 100.0, "ratio": None}
-    text = _verdict([line("small", small, 10.0), line("middle", ALIKE, middle_flops), largest])
-    too_few_shapes = [line(name, [1.1] * 6, 10.0) for name in "abc"]
-    assert "fewest" not in _verdict([*too_few_shapes, largest])
+def test_the_verdict_names_the_smallest_prior_without_a_larger_error(small, middle, words):
+    largest = {"row": "large", "flops": 1.0, "weights": 100, "ratio": None}
+    text = _verdict([line("small", small, 10), line("middle", middle, 50), largest])
+    too_few_shapes = [line(name, [1.1] * 6, 10) for name in "abc"]
+    assert "smallest" not in _verdict([*too_few_shapes, largest])
     assert words in text and ("small 1.5" in text) == (small is WORSE)
 
 
