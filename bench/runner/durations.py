@@ -117,7 +117,7 @@ def show_plan(plan: Plan, reused: set[str], workers: int) -> None:
     if reused:
         parts.append(f"{len(reused)} reused")
     if unknown := sum(not group for group in to_run.values()):
-        parts.append(f"{unknown} of unknown time (no similar run has finished here, and none is shipped)")
+        parts.append(f"{unknown} of unknown time (no similar run with a runtime is here, or shipped)")
     text = ", ".join(parts) + ("" if to_run else "; nothing is left to do")
     if means := [fmean(group) for group in to_run.values() if group]:
         concurrency = min(workers, len(to_run))

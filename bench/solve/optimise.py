@@ -64,7 +64,7 @@ class OptimiserSettings:
     start_noise: float = 0.0
 
     def __post_init__(self) -> None:
-        check_at_least("task.optimiser.iterations", self.iterations, 1, "the paper uses 100")
+        check_at_least("task.optimiser.iterations", self.iterations, 1, "DIST uses 100")
         check_positive("task.optimiser.learning_rate", self.learning_rate, "0.01 to 0.1 suit")
         check_choice("task.optimiser.schedule", self.schedule, SCHEDULES)
         if self.budget is not None:
@@ -72,7 +72,9 @@ class OptimiserSettings:
         check_choice("task.optimiser.ends", self.ends, (ITERATIONS, BUDGET, HELD_OUT))
         check_at_least("task.optimiser.start_noise", self.start_noise, 0, "1e-6 shows the run-to-run spread")
         if self.ends == HELD_OUT and self.schedule != "constant":
-            raise ValueError("task.optimiser.ends=held_out may end early: set task.optimiser.schedule=constant")
+            raise ValueError(
+                "effort=needed (ends=held_out) is for task=completion and task.optimiser.schedule=constant"
+            )
         if self.ends == BUDGET and self.budget is None:
             raise ValueError("task.optimiser.ends=budget needs task.optimiser.budget=COST, such as 4e6")
 

@@ -49,7 +49,8 @@ NOTES = (
     "A breakdown is the severity at which half of the trials fail, as a percentage of the axis: 0 % is the mildest "
     "severity, 100 % the severest. In brackets: its interval, or the failed trials at that end of the axis. A renderer "
     "survives if its breakdown lies beyond the severest severity, even if a few trials fail there.",
-    "A renderer that refuses a field ranks last on that axis. Rows without fits have breakdowns of renderings only.",
+    "A renderer that refuses a field, or was not run on an axis, ranks last there: compare renderers on the same axes. "
+    "Rows without fits have breakdowns of renderings only.",
     "“Breaks first” and “Then” are the axes with the lowest breakdowns. Among equal ones, the axis on which the median "
     "renderer survives most is shown. “Best on” is the axis on which the renderer is farthest above the median "
     "renderer. Settings of renderers are left out.",

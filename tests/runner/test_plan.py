@@ -65,7 +65,7 @@ def test_a_sweep_is_listed_and_nothing_is_written(results):
     *cells, summary = result.out.splitlines()
     assert [line.split("  ")[-1] for line in cells] == ["time unknown"] * 4
     assert "renderer=dvr seed=1  completion, DVR, n = 128, sofa" in cells[3]
-    assert summary == "4 planned: 4 to run, 4 of unknown time (no similar run has finished here, and none is shipped)"
+    assert summary == "4 planned: 4 to run, 4 of unknown time (no similar run with a runtime is here, or shipped)"
     assert not results.exists()
 
 

@@ -41,7 +41,8 @@ figure and the notes. The same folder has the table as CSV (raw numbers, in scen
 as PNG and PDF. `python -m bench -m +experiment=NAME` makes the runs of an experiment again. [conf](../conf/README.md)
 lists the experiments and how long they take. A page that cannot be drawn from rows names the version that drew it.
 
-`paper/NAME.runs.csv.gz` has the runs of the experiment NAME: one line per run, one column per field. A cell is empty if
+`suite` has the runs of the suite. `paper/NAME.runs.csv.gz` has the runs of the experiment NAME: one line per run, one
+column per field. A cell is empty if
 the run has no such field. `pandas.read_csv("results/paper/table3.runs.csv.gz")` reads it, in the checkout's folder.
 
 | question | answer | experiment |

@@ -11,6 +11,7 @@ from bench.evaluate.state import State
 from bench.setup.inputs import RunContext, RunInputs
 from bench.solve.optimise import BUDGET, OptimiserSettings, with_affordable_rays
 from bench.solve.solve import check_field_gradient, solve_and_draw
+from bench.tasks.capacity.names import parse_field_name
 from bench.tasks.reconstruction import background as behind
 from bench.tasks.reconstruction import cameras
 from bench.tasks.reconstruction.blur import BLUR_SHARE, PointBlur
@@ -101,7 +102,9 @@ class Reconstruction(PhotographTask):
             raise ValueError(f"task.rays must be a multiple of 4 for patches of 2 x 2 pixels, not {self.rays}: 1024")
 
     def check(self, inputs: RunInputs) -> None:
-        """Raises BadInput for several rays per pixel with observations of single rays, and for trials without end."""
+        """Raises ValueError for unknown candidates, trials without end, and observations of single rays."""
+        for name in self.auto.candidates if inputs.field.name == AUTO else ():
+            parse_field_name(name)
         if inputs.field.name == AUTO and self.optimiser.ends == BUDGET:
             reason = "field=auto tries each field for a fraction of the iterations, which a budget does not set"
             raise BadInput(f"{reason}: remove task.optimiser.ends=budget, or name a field, such as field=network_4x128")
