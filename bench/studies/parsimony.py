@@ -163,7 +163,7 @@ def _panel(lines: list[Line]) -> tuple[chart.Panel, Labels]:
     *coarser, line = lines
     drawn, labels = list[chart.Series](), Labels()
     for dash, each in zip(("-", "--", "-."), (line, *reversed(coarser)), strict=False):
-        drawn += _front(each, dash, several=bool(coarser))
+        drawn += _front(each, dash, is_coarser=each is not line)
     drawn += [_point(line, candidate) for candidate in line["candidates"].results]
     for choice, (*_, heading, marker, size) in CHOICES.items():
         if candidate := line.get(choice):
@@ -171,6 +171,7 @@ def _panel(lines: list[Line]) -> tuple[chart.Panel, Labels]:
             drawn.append(chart.series(heading, "", *_position(candidate), text=[[candidate.label]]) | ring)
             labels[candidate.numbers[FLOPS], 1000 * candidate.numbers["error"]] = candidate.label
     title = f"{line['scene']} ({line['problem']})" if line["problem"] else line["scene"]
+    title += f", {line['pixels']} pixels" if coarser else ""
     return chart.panel_data(title, AXES[FLOPS], "held-out error × 1000", drawn), labels
 
 
@@ -179,13 +180,13 @@ def _position(candidate: CandidateResult) -> tuple[list[float], list[float]]:
     return [candidate.numbers[FLOPS]], [error]
 
 
-def _front(line: Line, dash: str, *, several: bool) -> list[chart.Series]:
-    """The front of error over FLOPs, with the resolution in its name if there are several, and half a pixel."""
+def _front(line: Line, dash: str, *, is_coarser: bool) -> list[chart.Series]:
+    """The front of error over FLOPs, with the resolution in its name if that is not the finest, and half a pixel."""
     points = [_position(candidate) for candidate in line["candidates"].results]
     if not points:
         return []
     x, y = ([value for (value,) in values] for values in zip(*points, strict=True))
-    suffix = f" at {line['pixels']} pixels" if several else ""
+    suffix = f" at {line['pixels']} pixels" if is_coarser else ""
     front = chart.front(x, y) | {"name": f"front of error and FLOPs{suffix}", "dash": dash, "quiet": False}
     level = chart.level("half a pixel", x, 1000 * line["footprint"], colour=PIXEL_COLOUR, dash=":")
     return [front, level]
