@@ -78,7 +78,7 @@ def weights(layers: int, width: int, code_length: int, skip: int, *, narrow: boo
 
 
 def _verdict(lines: list[Line]) -> str:
-    """The significant ratios of a renderer's errors, and its smallest prior without a significantly larger error."""
+    """A renderer's number of priors with a significantly larger error, and its smallest other prior."""
     largest = lines[-1]
     ratios = [(line["row"], compare.ratio_of(line["ratio"])) for line in lines]
     text = compare.differing(ratios, f"of errors, to {largest['row']},")
@@ -92,10 +92,11 @@ def _verdict(lines: list[Line]) -> str:
     candidates = [line for line in (*similar, largest) if line["flops"]]  # with a run that ended ok
     if not tested or statistics.Verdict.NOT_DECIDABLE in verdicts or largest not in candidates:
         return text
+    text = f"{compare.HOLM}, *{sum(is_larger)} of {len(tested)}* priors have a larger error than {largest['row']}."
     smallest = min(candidates, key=lambda line: line["weights"])
     if smallest is largest:
-        return f"{text} Every smaller prior has a significantly larger error."
-    return f"{text} Without a significantly larger error, {smallest['row']} is the smallest."
+        return f"{text} No smaller prior suffices."
+    return f"{text} The smallest of the others is *{smallest['row']}*."
 
 
 def _panels(pooled: list[Line]) -> list[chart.Panel]:
