@@ -81,7 +81,6 @@ def _verdict(lines: list[Line]) -> str:
     """A renderer's number of priors with a significantly larger error, and its smallest other prior."""
     largest = lines[-1]
     ratios = [(line["row"], compare.ratio_of(line["ratio"])) for line in lines]
-    text = compare.differing(ratios, f"of errors, to {largest['row']},")
     tested = [(line, ratio) for line, (_, ratio) in zip(lines, ratios, strict=True) if ratio and ratio.has_ends]
     verdicts = statistics.ratio_verdicts([ratio for _, ratio in tested])
     is_larger = [
@@ -91,7 +90,7 @@ def _verdict(lines: list[Line]) -> str:
     similar = [line for (line, _), larger in zip(tested, is_larger, strict=True) if not larger]
     candidates = [line for line in (*similar, largest) if line["flops"]]  # with a run that ended ok
     if not tested or statistics.Verdict.NOT_DECIDABLE in verdicts or largest not in candidates:
-        return text
+        return compare.differing(ratios, f"of errors, to {largest['row']},")
     text = f"{compare.HOLM}, *{sum(is_larger)} of {len(tested)}* priors have a larger error than {largest['row']}."
     smallest = min(candidates, key=lambda line: line["weights"])
     if smallest is largest:

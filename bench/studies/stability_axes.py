@@ -86,9 +86,10 @@ def make_cost(runs: Runs) -> Result:
     lines["preset"] = list(cells.drop_duplicates("row")["preset"])
     means = lines["rank"].map(lambda rank: rank.value)
     lines["behind"] = lines.groupby(["cost", means]).cumcount()  # points at the same position are drawn smaller
+    ranked = lines[["cost"]].assign(rank=means).dropna()
     points = [
         chart.series(line.row, line.preset, [line.cost], [line.rank], size=12 / (1 + 0.4 * line.behind))
-        for line in lines[lines["cost"].notna() & means.notna()].itertuples()
+        for line in lines.loc[ranked.index].itertuples()
     ]
     costs = [f"{line.row}, {format.number(line.cost)}" for line in lines.itertuples()]
     title = "Mean rank (1 is best) and field evaluations per ray"
@@ -100,9 +101,9 @@ def make_cost(runs: Runs) -> Result:
         "Robustness over cost.",
         "Mean rank of a renderer's breakdowns, over its median of field evaluations per ray at the mildest severity.",
         question="Do robust renderers cost more field evaluations?",
-        verdict=f"{_related(lines['cost'], means)} {ends} {_alike(ranks)}".strip(),
+        verdict=f"{_related(ranked)} {ends} {_alike(ranks)}".strip(),
         n=f"{shared['axis'].nunique()} axes and {len(lines)} renderers",
-        remarks=[*COST_NOTES, _power((lines["cost"].notna() & means.notna()).sum())],
+        remarks=[*COST_NOTES, _power(len(ranked))],
         columns=COST_COLUMNS,
         lines=lines.to_dict("records"),
         figure=chart.draw([panel], 3.6),
@@ -137,14 +138,15 @@ def make_curves(runs: Runs) -> Result:
     )
 
 
-def _related(costs: pd.Series, ranks: pd.Series) -> str:
-    """A sentence on the correlation of ranks and costs; empty with few renderers."""
-    both = costs.notna() & ranks.notna()
-    rho, p = statistics.rank_correlation(costs[both], ranks[both]) if both.sum() >= MIN_CORRELATED else (math.nan, 1.0)
+def _related(ranked: pd.DataFrame) -> str:
+    """A sentence on the correlation of the columns "cost" and "rank"; empty with few renderers."""
+    if len(ranked) < MIN_CORRELATED:
+        return ""
+    rho, p = statistics.rank_correlation(ranked["cost"], ranked["rank"])
     if math.isnan(rho):
         return ""
     answer = "No significant correlation" if p >= statistics.ALPHA else "Yes" if rho < 0 else "No, they cost fewer"
-    return f"{answer}: Spearman's correlation of rank and cost is *{rho:.2f}* (p = {p:.2g}, {both.sum()} renderers)."
+    return f"{answer}: Spearman's correlation of rank and cost is *{rho:.2f}* (p = {p:.2g}, {len(ranked)} renderers)."
 
 
 def _power(count: int) -> str:

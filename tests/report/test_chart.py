@@ -68,6 +68,15 @@ def test_bars_do_not_reach_the_next_position(positions):
     assert np.isfinite(drawn).all() and (np.diff(drawn[:2].flatten()) > 0).all()
 
 
+def test_lines_keep_their_order_whether_they_have_intervals_or_not():
+    exact = curve("exact", "dist", [1, 16], [1, 2])
+    for count in (2, 6):  # with bands, and with bars
+        others = [curve(name, "dist", [1, 16], KNOWN) for name in "abcdef"[:count]]
+        drawn = axis_of(others[0], exact, *others[1:]).lines
+        assert [line.get_label() for line in drawn] == ["a", "exact", *"bcdef"[: count - 1]]
+        assert list(drawn[1].get_xdata()) == [1, 16]
+
+
 def test_without_an_interval_the_points_of_the_shapes_are_drawn():
     made = series("a", "dist", [7], FEW)
     assert "low" not in made and made["shapes"] == [[7, 1], [7, 3]]

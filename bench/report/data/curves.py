@@ -11,6 +11,7 @@ from bench.records.record import as_number
 from bench.records.results import curve_lines
 from bench.report.data.records import CHAMFER_SCALE, Record, measured
 from bench.report.data.runs import Runs
+from bench.report.data.statistics import rank_correlation
 
 HISTORY = ("iteration", "seconds", "value_evaluations", "error", "loss")
 COLUMNS = ("iteration", "seconds", "value_evaluations", "total", "chamfer_l2")
@@ -72,4 +73,4 @@ def history_of(runs: Runs, record: Record) -> pd.DataFrame:
 def spearman(points: pd.DataFrame, first: str = "loss", second: str = "error") -> float | None:
     """The rank correlation of two columns; None for fewer than three points, or if a column is constant."""
     varied = len(points) > 2 and all(points[column].nunique() > 1 for column in (first, second))
-    return float(np.corrcoef(points[[first, second]].rank().T)[0, 1]) if varied else None
+    return rank_correlation(points[first], points[second])[0] if varied else None

@@ -243,11 +243,11 @@ def _mean_interval(values: np.ndarray) -> Interval:
 
 def rank_correlation(first: Values, second: Values) -> tuple[float, float]:
     """Spearman's correlation, and its two-sided p value by Student's t approximation; NaN without variation."""
-    ranks = [pd.Series(np.asarray(values)).rank() for values in (first, second)]
-    rho, freedom = float(ranks[0].corr(ranks[1])), len(ranks[0]) - 2
-    with np.errstate(divide="ignore"):  # at a correlation of 1
-        t = abs(rho) * np.sqrt(freedom / (1 - np.float64(rho) ** 2))
-    return rho, 2 * float(special.stdtr(freedom, -t)) if freedom > 0 else math.nan
+    ranks, freedom = [pd.Series(np.asarray(values)).rank() for values in (first, second)], len(first) - 2
+    with np.errstate(divide="ignore", invalid="ignore"):  # at a correlation of 1, and without variation
+        rho = np.corrcoef(ranks)[0, 1]
+        t = abs(rho) * np.sqrt(freedom / (1 - rho**2))
+    return float(rho), 2 * float(special.stdtr(freedom, -t)) if freedom > 0 else math.nan
 
 
 def smallest_significant_correlation(n: int) -> float:

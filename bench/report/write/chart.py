@@ -124,10 +124,9 @@ def _edge(panels: Sequence[Panel], letter: str) -> float:
 
 
 def _panel(axis: Axes, panel: Panel, edge: float) -> None:
-    banded = [each for each in _shown(panel) if {"dash", "low"} <= each.keys()]
-    as_bars = len(banded) > MAX_BANDS and max(len(each["x"]) for each in banded) <= MAX_BARS
-    shifted = _side_by_side(banded, log=panel["x"]["log"]) if as_bars else banded
-    for each in [*(each for each in _shown(panel) if each not in banded), *shifted]:
+    lengths = [len(each["x"]) for each in _shown(panel) if _has_band(each)]
+    as_bars = len(lengths) > MAX_BANDS and max(lengths) <= MAX_BARS
+    for each in _side_by_side(_shown(panel), log=panel["x"]["log"]) if as_bars else _shown(panel):
         _series(axis, each, [_edge([panel], "x"), edge], across="rows" in panel, bars=as_bars)
     for letter in "xy":
         if panel[letter]["log"]:
@@ -142,16 +141,20 @@ def _panel(axis: Axes, panel: Panel, edge: float) -> None:
     axis.set(title=panel["title"], xlabel=panel["x"]["title"], ylabel=panel["y"]["title"])
 
 
-def _side_by_side(all_series: Sequence[Series], *, log: bool) -> list[Series]:
-    """The series, moved along x so that their bars do not overlap."""
+def _has_band(each: Series) -> bool:
+    return "dash" in each and "low" in each
+
+
+def _side_by_side(shown: Sequence[Series], *, log: bool) -> list[Series]:
+    """The series, those with bands moved along x so that bars in their place do not overlap."""
     forward, back = (np.log, np.exp) if log else (np.asarray, np.asarray)
-    positions = [forward(each["x"]) for each in all_series]
+    positions = [forward(each["x"]) for each in shown if _has_band(each)]
     places = np.unique(np.concatenate([x[np.isfinite(x)] for x in positions]))
     width, gap = (np.ptp(places), np.diff(places).min()) if len(places) > 1 else (1.0, 1.0)
-    step = min(BAR_STEP * width, 0.8 * gap / len(all_series))
-    middle = (len(all_series) - 1) / 2
-    moved = [back(x + (index - middle) * step) for index, x in enumerate(positions)]
-    return [each | {"x": x} for each, x in zip(all_series, moved, strict=True)]
+    step = min(BAR_STEP * width, 0.8 * gap / len(positions))
+    middle = (len(positions) - 1) / 2
+    moved = (back(x + (index - middle) * step) for index, x in enumerate(positions))
+    return [each | {"x": next(moved)} if _has_band(each) else each for each in shown]
 
 
 def _series(axis: Axes, each: Series, edges: list[float], *, across: bool, bars: bool) -> None:

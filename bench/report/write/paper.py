@@ -42,8 +42,8 @@ as PNG and PDF. `python -m bench -m +experiment=NAME` makes the runs of an exper
 lists the experiments and how long they take. A page that cannot be drawn from rows names the version that drew it.
 
 `suite` has the runs of the suite. `paper/NAME.runs.csv.gz` has the runs of the experiment NAME: one line per run, one
-column per field. A cell is empty if
-the run has no such field. `pandas.read_csv("results/paper/table3.runs.csv.gz")` reads it, in the checkout's folder.
+column per field. A cell is empty if the run has no such field.
+`pandas.read_csv("results/paper/table3.runs.csv.gz")` reads it, in the checkout's folder.
 
 | question | answer | experiment |
 |---|---|---|

@@ -103,11 +103,13 @@ class Reconstruction(PhotographTask):
 
     def check(self, inputs: RunInputs) -> None:
         """Raises ValueError for unknown candidates, trials without end, and observations of single rays."""
-        for name in self.auto.candidates if inputs.field.name == AUTO else ():
-            parse_field_name(name)
-        if inputs.field.name == AUTO and self.optimiser.ends == BUDGET:
-            reason = "field=auto tries each field for a fraction of the iterations, which a budget does not set"
-            raise BadInput(f"{reason}: remove task.optimiser.ends=budget, or name a field, such as field=network_4x128")
+        if inputs.field.name == AUTO:
+            for name in self.auto.candidates:
+                parse_field_name(name)
+            if self.optimiser.ends == BUDGET:
+                reason = "field=auto tries each field for a fraction of the iterations, which a budget does not set"
+                remedy = "remove task.optimiser.ends=budget, or name a field, such as field=network_4x128"
+                raise BadInput(f"{reason}: {remedy}")
         if inputs.views.rays_per_pixel > 1:
             self.losses.check_rays_per_pixel(depths=self.depths.points != NONE)
 

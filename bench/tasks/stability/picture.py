@@ -31,23 +31,19 @@ def draw_breakdown(folder: Path, trials: list[Trial], unit: str, title: str) -> 
     Returns:
         "works" and "breaks", the kinds of errors as a small PNG in a data URI; "works_text" and "breaks_text".
     """
-    names = ["works" if trial.outcome.success else "breaks" for trial in trials]
-    arrays = {
-        f"{name}_{key}": image
-        for name, trial in zip(names, trials, strict=True)
-        for key, image in {"severity": np.float64(trial.severity), **trial.outcome.images}.items()
-    }
-    np.savez_compressed(folder / "images.npz", **arrays)  # type: ignore[arg-type]
-    texts = [_text(trial, unit) for trial in trials]
+    arrays, pictures = dict[str, np.ndarray](), dict[str, str]()
     figure = Figure(figsize=(9.2, 3.6 * len(trials) + 0.3), layout="constrained")
     lines = figure.subfigures(len(trials), 1, squeeze=False)[:, 0]
-    for line, text, trial in zip(lines, texts, trials, strict=True):
+    for line, trial in zip(lines, trials, strict=True):
+        name, text, images = "works" if trial.outcome.success else "breaks", _text(trial, unit), trial.outcome.images
+        arrays |= {f"{name}_severity": np.array(trial.severity)} | {f"{name}_{key}": images[key] for key in images}
+        pictures |= {name: _thumbnail(images["kinds"]), f"{name}_text": text}
         line.suptitle(text, fontsize=10)
-        _draw_line(line, trial.outcome.images)
+        _draw_line(line, images)
     figure.suptitle(title)
     save(figure, folder / "failure.png")
-    pictures = [_thumbnail(trial.outcome.images["kinds"]) for trial in trials]
-    return dict(zip(names, pictures, strict=True)) | {f"{k}_text": text for k, text in zip(names, texts, strict=True)}
+    np.savez_compressed(folder / "images.npz", **arrays)  # type: ignore[arg-type]
+    return pictures
 
 
 def _text(trial: Trial, unit: str) -> str:
