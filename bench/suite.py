@@ -6,7 +6,8 @@
     python -m bench.suite suite=core hydra/launcher=slurm       the large size, on a cluster
     python -m bench.suite set=pose,complete                     some sets of problems
     python -m bench.suite budget=10                             at 10 units of cost; 1,10 is both
-    python -m bench.suite setting=tuned renderer=newton         with its settings of conf/tuned.yaml, as a second row
+    python -m bench.suite setting=tuned renderer=newton         with its own learning rate and rays, as a second row
+    python -m bench.suite setting=candidates renderer=newton    chooses these: runs the candidates on validation shapes
     python -m bench.suite plan=true                             what would run, and for how long
 
 Any other KEY=VALUE is passed to `python -m bench`.
@@ -17,7 +18,6 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from bench.records.format import MISSING, number, plural, seconds
 from bench.records.read import read_records
@@ -30,7 +30,6 @@ from bench.report.suite.attempts import (
     NOISE_KEY,
     PROBLEM_SETTINGS,
     SECOND_SUFFIX,
-    TUNED_PREFIX,
     TUNED_SUFFIX,
     attempts_of,
     gather,
@@ -40,6 +39,7 @@ from bench.report.suite.attempts import (
     write_attempts,
 )
 from bench.report.suite.standing import KEY, Standing, units
+from bench.report.suite.tuned import CANDIDATES, STATED, chosen_settings, setting_overrides
 from bench.report.write import paper
 from bench.report.write.html import MAX_MESHES, page_lock, write_page
 from bench.report.write.table import percent
@@ -47,16 +47,17 @@ from bench.runner.command import command_line
 from bench.runner.run import run_one
 from bench.runner.summary import print_statuses
 from bench.runner.sweep import run_sweep
-from bench.tables import CONF, METHOD, choice, names, nearest, read_yaml
+from bench.tables import nearest
 
 PAGE = "suite"  # its file name in the folder `paper`
 FINISHED_EXIT_STATUSES = (0, 1)  # the sweep has ended, though runs may have failed
-TUNED_LABEL = f"label='${{renderer._label_}}{TUNED_SUFFIX}'"
 STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*FIXED_KEYS, 'sizes', 'scale', 'models', 'effort'])})(\W|$)|dataset\.)"
 AXES = (*(key for key, _, _ in PROBLEM_SETTINGS.values()), NOISE_KEY)  # may be typed: some problems, a second start
 SETUP_AND_EVALUATION_SECONDS = 2.0  # per run
 MAX_PRINTED_PROBLEMS = 6  # with more problems, the errors are not printed one by one
-SETTING_VALUES = ("stated", "tuned")  # the set's setting for all renderers, or that of conf/tuned.yaml
+SETTING_VALUES = (STATED, "tuned", CANDIDATES)  # the set's for all renderers; each one's own; those it is chosen from
+VALIDATION = "validation"
+VALIDATION_SHAPES = [f"split={VALIDATION}", "index=0,1"]
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -67,8 +68,9 @@ def main(arguments: Sequence[str]) -> int:
     try:
         options, overrides = parse_arguments(arguments)
         results_dir = Path(dict(text.split("=", 1) for text in overrides).get("results_dir", RESULTS))
-        print(_expected_runtime(options, _renderers(overrides)))
-        for title, keys in _sweeps(options, overrides):
+        if options["setting"] != CANDIDATES:
+            print(_expected_runtime(options, _renderers(overrides)))
+        for title, keys in _sweeps(options, overrides, results_dir):
             print(title, flush=True)
             sys.argv[1:] = ["-m", *keys]  # like `python -m bench -m`, in this process, without a page
             code = command_line(run_one, lambda composer, config: run_sweep(composer, config, print_statuses))
@@ -82,7 +84,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """The options of this command, with defaults, and the overrides that it passes on; or ValueError."""
-    options, overrides = {"suite": "quick", "set": ",".join(suite().errors), "setting": "stated"}, list[str]()
+    options, overrides = {"suite": "quick", "set": ",".join(suite().errors), "setting": STATED}, list[str]()
     budgets = sorted({f"{budget:g}" for *_, budget in problems_of("core")})
     for argument in arguments:
         key, _, value = argument.partition("=")
@@ -99,8 +101,8 @@ def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
         else:
             raise ValueError(f"{argument!r} is no KEY=VALUE: python -m bench.suite --help has examples")
     noise = [text.partition("=")[2] for text in overrides if text.startswith(NOISE_KEY)]
-    if noise and (options["setting"] == "tuned" or noise != ["1e-6"]):
-        raise ValueError(f"a second start is {NOISE_KEY}=1e-6, without setting=tuned")
+    if noise and (options["setting"] != STATED or noise != ["1e-6"]):
+        raise ValueError(f"a second start is {NOISE_KEY}=1e-6, with setting=stated")
     options.setdefault("budget", ",".join(budgets) if options["suite"] == "core" else budgets[0])
     allowed_words = {"suite": suite().sizes, "set": suite().errors, "setting": SETTING_VALUES, "budget": budgets}
     for key, allowed in allowed_words.items():
@@ -145,48 +147,54 @@ def shipped_rows() -> set[str]:
     return {attempt.row for attempt in read_attempts(paper.SHIPPED)[0] if not attempt.second_start}
 
 
-def _sweeps(options: dict[str, str], overrides: list[str]) -> list[tuple[str, list[str]]]:
-    """The title of each sweep and its overrides, one per set or tuned method; or ValueError without a setting."""
+def _sweeps(options: dict[str, str], overrides: list[str], results_dir: Path) -> list[tuple[str, list[str]]]:
+    """The title of each sweep and its overrides, one per set and setting; or ValueError without a setting."""
     sets, sweeps = options["set"].split(","), list[tuple[str, list[str]]]()
-    renderers = _renderers(overrides)
-    others = [text for text in overrides if not text.startswith("renderer=")]
+    size = "smoke" if options["suite"] == "smoke" else "quick"
+    size = size if options["setting"] == CANDIDATES else options["suite"]
     for position, name in enumerate(sets, 1):
         title = f"set {position} of {len(sets)}: {name}"
-        budgets = ",".join(f"{float(budget) * suite().units[name]:.1e}" for budget in options["budget"].split(","))
-        keys = [f"+experiment={EXPERIMENT_PREFIX}{name}", f"sizes.chosen={suite().sizes[options['suite']]}"]
-        keys.append(f"{BUDGET_KEY}={budgets}")
-        if options["setting"] == "stated":
-            sweeps.append((title, [*keys, *overrides]))
+        keys = [f"+experiment={EXPERIMENT_PREFIX}{name}", f"sizes.chosen={suite().sizes[size]}"]
+        if options["setting"] == "tuned":
+            sweeps += _tuned_sweeps(title, name, keys, options["budget"].split(","), overrides, results_dir)
             continue
-        tuned = _tuned_choices(name, renderers)
-        sweeps += [(f"{title}, {method}", [*keys, *choices, *others]) for method, choices in tuned.items()]
-        if not tuned:
-            print(f"{title}: left out, since conf/tuned.yaml has no setting for it")
-    if not sweeps:
-        names = ", ".join(renderers) or "a renderer"
-        raise ValueError(f"conf/tuned.yaml has no setting of {names} for {options['set']}: leave out setting=tuned")
+        budgets = ",".join(_budget(name, budget) for budget in options["budget"].split(","))
+        keys += [f"{BUDGET_KEY}={budgets}", *overrides]
+        if options["setting"] == STATED:
+            sweeps.append((title, keys))
+        else:
+            keys += VALIDATION_SHAPES
+            sweeps += [(f"{title}, {each}", [*keys, *setting_overrides(name, each)]) for each in suite().candidates]
     return sweeps
 
 
-def _tuned_choices(set_name: str, renderers: list[str]) -> dict[str, list[str]]:
-    """The overrides that choose a tuned setting for a set and its loss, by method; of these renderers, or of all."""
-    task, overrides = _chosen(read_yaml(CONF / "experiment" / f"{EXPERIMENT_PREFIX}{set_name}.yaml"))["task"], {}
-    for method in (f"{TUNED_PREFIX}{name}" for name in names(f"{METHOD}/tuned")):
-        chosen = _chosen(choice(METHOD, method))
-        if chosen.get("task") == task and (not renderers or chosen["renderer"] in renderers):
-            overrides[method] = [f"+method={method}", f"silhouette={chosen.get('silhouette', 'own')}", TUNED_LABEL]
-    return overrides
+def _budget(set_name: str, budget: str) -> str:
+    return f"{float(budget) * suite().units[set_name]:.1e}"
 
 
-def _chosen(node: dict[str, Any]) -> dict[str, str]:
-    """The choices of an experiment or a method by group, including those of its bases."""
-    choices = dict[str, str]()
-    for base in node.get("defaults", ()):
-        if isinstance(base, dict):
-            choices |= {key.removeprefix("override /"): value for key, value in base.items()}
-        elif (name := base.removeprefix(f"/{METHOD}/")) in names(METHOD):
-            choices |= _chosen(choice(METHOD, name))
-    return choices
+def _tuned_sweeps(
+    title: str, set_name: str, keys: list[str], budgets: list[str], overrides: list[str], results_dir: Path
+) -> list[tuple[str, list[str]]]:
+    """The sweeps of the renderers whose setting is not the set's, by budget and setting; others are printed."""
+    label = next((text.partition("=")[2].strip("'\"") for text in overrides if text.startswith("label=")), "")
+    others = [text for text in overrides if not text.startswith(("renderer=", "label="))]
+    text = f"label='{label or '${renderer._label_}'}{TUNED_SUFFIX}'"
+    chosen, sweeps = chosen_settings(paper.SHIPPED, results_dir), list[tuple[str, list[str]]]()
+    for budget in budgets:
+        renderers = _renderers(overrides) or [name for *key, name in chosen if key == [float(budget), set_name]]
+        by_setting = dict[str, list[str]]()
+        for name in renderers:
+            setting = chosen.get((float(budget), set_name, label if name == CUSTOM and label else name), "")
+            by_setting.setdefault(setting, []).append(name)
+        if missing := by_setting.pop("", [] if renderers else ["any renderer"]):
+            command = f"setting={CANDIDATES} set={set_name} budget={budget}"
+            raise ValueError(f"no setting of {', '.join(missing)} was chosen: first run bench.suite {command}")
+        if stated := by_setting.pop(STATED, []):
+            print(f"{title}, {', '.join(stated)}: the set's setting is the best one, so its runs count")
+        for setting, names in by_setting.items():
+            more = [f"{BUDGET_KEY}={_budget(set_name, budget)}", f"renderer={','.join(names)}", text]
+            sweeps.append((f"{title}, {setting}", [*keys, *more, *setting_overrides(set_name, setting), *others]))
+    return sweeps
 
 
 def print_standing(results_dir: Path) -> int:
@@ -194,6 +202,7 @@ def print_standing(results_dir: Path) -> int:
     with page_lock(results_dir):
         records, unread = read_records(results_dir)
         write_attempts(attempts_of(records, results_dir), results_dir)
+        write_attempts(attempts_of(records, results_dir, VALIDATION), results_dir, CANDIDATES)
         written = paper.write_paper(records, results_dir, only=PAGE)
         index = write_page(records, unread, results_dir, MAX_MESHES)
     gathered = gather(paper.SHIPPED, results_dir)

@@ -29,7 +29,6 @@ ITERATIONS, BUDGET, HELD_OUT = "iterations", "budget", "held_out"  # what ends a
 HELD_OUT_INTERVAL = 5  # iterations between two measurements of the loss of held-out pixels
 HELD_OUT_PATIENCE, HELD_OUT_GAIN = 2, 0.02
 FINAL_ITERATIONS = 10
-AFFORDED_ITERATIONS = 40  # for which `with_affordable_rays` chooses the rays
 BLOCKS = (1, 2, 4, 8)  # pixels per side of a block of which an iteration has one ray
 SCHEDULES = ("constant", "cosine", "ramped", "steps")
 RATE_DROP_FRACTIONS = (0.6, 0.8)  # the rate of "steps" falls to a fifth there (DVR: 750 and 1,000 epochs)
@@ -54,6 +53,7 @@ class OptimiserSettings:
             schedules over `iterations` follow the spent fraction of the budget; "held_out": when the loss of held-out
             pixels stops falling, see `_Patience`, after `iterations` at most; schedules then end early.
         start_noise: standard deviation of normal noise in all initial parameters, for the run-to-run spread.
+        afforded_iterations: the number for which `with_affordable_rays` chooses the rays of an iteration.
     """
 
     iterations: int
@@ -62,6 +62,7 @@ class OptimiserSettings:
     budget: float | None = None
     ends: str = ITERATIONS
     start_noise: float = 0.0
+    afforded_iterations: int = 40
 
     def __post_init__(self) -> None:
         check_at_least("task.optimiser.iterations", self.iterations, 1, "DIST uses 100")
@@ -71,6 +72,7 @@ class OptimiserSettings:
             check_positive("task.optimiser.budget", self.budget, "the suite has 2.5e5 to 1e7, null is none")
         check_choice("task.optimiser.ends", self.ends, (ITERATIONS, BUDGET, HELD_OUT))
         check_at_least("task.optimiser.start_noise", self.start_noise, 0, "1e-6 shows the run-to-run spread")
+        check_at_least("task.optimiser.afforded_iterations", self.afforded_iterations, 1, "the suite has 40")
         if self.ends == HELD_OUT and self.schedule != "constant":
             raise ValueError(
                 "effort=needed (ends=held_out) is for task=completion and task.optimiser.schedule=constant"
@@ -144,7 +146,7 @@ class _Patience:
 def with_affordable_rays(task: Any, make_problem: Callable[[Any], Any]) -> Any:
     """Makes the problem of a task with settings `optimiser` and `pixel_block`, the pixels per side of a block.
 
-    If `pixel_block` is 0, it becomes the smallest of `BLOCKS` with which the budget pays for `AFFORDED_ITERATIONS`,
+    If `pixel_block` is 0, it becomes the smallest of `BLOCKS` with which the budget pays for `afforded_iterations`,
     else the largest. One uncounted iteration measures the cost, with the initial parameters and the final values of
     schedules.
     """
@@ -155,7 +157,7 @@ def with_affordable_rays(task: Any, make_problem: Callable[[Any], Any]) -> Any:
         problem = make_problem(sampled)
         with suppress(CannotContinue):  # the loop reports it
             problem.loss(Iteration(0, task.optimiser.iterations - 1))["total"].backward()
-        if AFFORDED_ITERATIONS * problem.counts.cost <= (task.optimiser.budget or inf):
+        if task.optimiser.afforded_iterations * problem.counts.cost <= (task.optimiser.budget or inf):
             break
     return make_problem(sampled)  # a new one, whose counts are 0
 

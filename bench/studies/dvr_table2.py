@@ -7,7 +7,6 @@ from bench.records.published import DVR_TABLE2
 from bench.records.record import as_number
 from bench.report.data.records import CHAMFER_SCALE, Record, Row, grouped, row_of, setting
 from bench.report.study import Result, Runs, Selection, format, gallery, medians, table
-from bench.report.suite.attempts import TUNED_PREFIX
 
 PLACE = 45
 READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
@@ -119,7 +118,7 @@ def _photograph_settings(runs: Runs) -> str:
 
 
 def figures(runs: Runs) -> Result:
-    distinct = [row for row in runs.rows() if row.preset.removeprefix(TUNED_PREFIX) not in LOOKALIKES]
+    distinct = [row for row in runs.rows() if row.preset.removeprefix("tuned/") not in LOOKALIKES]
     rows, by_scene = distinct or list(runs.rows()), grouped(runs.records, medians.scene_of)
     shown = {
         name: {row_of(record): record for record in group if row_of(record) in rows}

@@ -43,6 +43,7 @@ from bench.report.suite.standing import (
     verified_ranking,
     with_progress,
 )
+from bench.report.suite.tuned import CANDIDATES, setting_overrides, stated_rate
 from bench.studies import suite as study
 from bench.suite import _expected_runtime, _sweeps, main, parse_arguments, print_standing
 from bench.tables import choice
@@ -376,7 +377,7 @@ def test_what_is_not_its_own_is_passed_on():
 
 @each("given, budgets", [([], "4.0e+05"), (["budget=10"], "4.0e+06"), (["suite=core"], "4.0e+05,4.0e+06")])
 def test_a_sweep_has_the_chosen_budgets_in_units_of_its_set(given, budgets):
-    ((_, keys),) = _sweeps(*parse_arguments(["set=complete", *given]))
+    ((_, keys),) = _sweeps(*parse_arguments(["set=complete", *given]), Path())
     assert f"task.optimiser.budget={budgets}" in keys
 
 
@@ -392,21 +393,40 @@ def test_a_tuned_row_changes_no_comparison_and_has_lines_in_its_sets(tmp_path, m
     assert [line["row"] for line in lines] == ["B", "Dist", "Dist, tuned"] and lines[2]["progress_1"] == 1
 
 
-def test_tuned_settings_are_a_sweep_each_and_sets_without_one_are_left_out(capsys):
-    arguments = ["setting=tuned", "renderer=newton,mesh_proxy_48", "set=pose,reconstruct,complete", "verbose=true"]
-    own, passed = parse_arguments(arguments)
-    found = _sweeps(own, passed)
-    assert [said for said, _ in found] == [
-        "set 2 of 3: reconstruct, tuned/rgb_newton",
-        "set 3 of 3: complete, tuned/newton_mask",
+def test_each_renderer_has_the_candidate_that_is_best_on_validation_shapes(tmp_path, capsys):
+    errors = {"Dist": [3, 2, 1, 4], "Newton": [1, 2, 3, 4], "Mine": [4, 3, 2, 1]}  # in the order of the candidates
+    presets = {"Dist": "dist", "Newton": "newton", "Mine": "custom"}
+    runs = [
+        replace(
+            attempt(row, scene, {0: 9.0, 9: factor * error}, preset=presets[row], settings=candidate), overrides=changes
+        )
+        for row, numbers in errors.items()
+        for candidate, error in zip(suite().candidates, numbers, strict=True)
+        for changes in [setting_overrides("complete", candidate)]
+        for scene, factor in (("sofa validation 0", 1), ("sofa validation 1", 0.5))
     ]
-    assert {"silhouette=cross_entropy_sharp", "+method=tuned/rgb_newton", "verbose=true"} < {*found[0][1]}
-    assert "silhouette=own" in found[1][1] and not any(key.startswith("renderer=") for key in found[1][1])
-    assert capsys.readouterr().out == "set 1 of 3: pose: left out, since conf/tuned.yaml has no setting for it\n"
-    sweeps = _sweeps(*parse_arguments(["set=pose,complete"]))
-    assert [said for said, _ in sweeps] == ["set 1 of 2: pose", "set 2 of 2: complete"]
-    assert main(["setting=tuned", "renderer=mesh_proxy_48"]) == 2
-    assert "no setting of mesh_proxy_48 for complete," in capsys.readouterr().err
+    arguments = ["setting=tuned", "set=complete", "verbose=true"]
+    with pytest.raises(ValueError, match="setting=candidates set=complete budget=1"):
+        _sweeps(*parse_arguments([*arguments, "renderer=naive"]), tmp_path)
+    write_attempts(runs, tmp_path, CANDIDATES)
+    assert not read_attempts(tmp_path)[0]
+    shared = ["+experiment=core_complete", "sizes.chosen=desk", "task.optimiser.budget=4.0e+05"]
+    rate = f"task.optimiser.learning_rate={3 * stated_rate('complete'):.3g}"
+    ((title, keys),) = _sweeps(*parse_arguments([*arguments, "renderer=dist,newton"]), tmp_path)
+    label = "label='${renderer._label_}, tuned'"
+    assert title.endswith("faster") and keys == [*shared, "renderer=dist", label, rate, "verbose=true"]
+    assert "complete, newton: the set's setting is the best" in capsys.readouterr().out
+    ((_, keys),) = _sweeps(*parse_arguments([*arguments, "renderer=custom", "label=Mine"]), tmp_path)
+    assert {"renderer=custom", "label='Mine, tuned'", "+task.optimiser.afforded_iterations=160"} < {*keys}
+
+
+def test_candidates_are_the_same_for_all_renderers_on_validation_shapes():
+    sweeps = _sweeps(*parse_arguments(["set=pose,complete", "setting=candidates", "renderer=dist,idr"]), Path())
+    assert len(sweeps) == 2 * len(suite().candidates)
+    assert all({"split=validation", "renderer=dist,idr"} < {*keys} for _, keys in sweeps)
+    assert stated_rate("pose") == 0.1 and stated_rate("complete") == 0.0215
+    record = {"config": {"split": "validation", "experiment": "core_pose"}, "folder": "a", "status": "ok"}
+    assert not attempts_of([record], Path())
 
 
 MINE = '''
@@ -565,24 +585,24 @@ def test_without_anything_to_compare_both_pages_are_empty(tmp_path, monkeypatch)
         assert (result.verdict, len(result.lines)) == ("", 0)
 
 
-def test_settings_are_one_at_all_budgets_and_tuned_ones_are_free_in_weights_and_rate_alone(tmp_path):
+def test_settings_are_one_at_all_budgets_and_tuned_ones_are_free_in_rate_and_rays_alone(tmp_path):
     found, loop = {}, {"ends": "budget", "budget": 4e5}
     for name, task in {
         "one": {"optimiser": {"learning_rate": 0.1, **loop}, "silhouette_weight": 2.0},
-        "two": {"optimiser": {"learning_rate": 0.2, **loop}, "silhouette_weight": 3.0, "losses": {"eikonal": 1}},
+        "two": {"optimiser": {"learning_rate": 0.2, "afforded_iterations": 160, **loop}, "silhouette_weight": 2.0},
         "more": {"optimiser": {"learning_rate": 0.1, **loop, "budget": 4e6}, "silhouette_weight": 2.0},
         "code": {"optimiser": {"learning_rate": 0.1, **loop}, "silhouette_weight": 2.0, "depth_weight": 9},
     }.items():
-        for method in ("", "tuned/dist_mask"):
-            own = {"task": {"points": "20"} | task, "label": "Mine, tuned" if method else None}
-            write_completion(tmp_path / name / method, [0.8, 0.2], settings=own, method=method, renderer="dist")
-            (found[name, method],) = attempts_of(read_records(tmp_path / name / method)[0], tmp_path / name / method)
+        for label in ("Mine", "Mine, tuned"):
+            own, folder = {"task": {"points": "20"} | task, "label": label}, tmp_path / name / label
+            write_completion(folder, [0.8, 0.2], settings=own, renderer="dist")
+            (found[name, label],) = attempts_of(read_records(folder)[0], folder)
     stated, tuned = (
-        {name: one for (name, of), one in found.items() if of == method} for method in ("", "tuned/dist_mask")
+        {name: one for (name, of), one in found.items() if of == label} for label in ("Mine", "Mine, tuned")
     )
     assert len({one.settings for one in stated.values()}) == 3 and not stated["one"].tuned
     assert stated["one"].settings == stated["more"].settings and stated["more"].budget == 10
-    assert tuned["one"].settings == tuned["two"].settings == tuned["more"].settings
+    assert tuned["one"].settings == tuned["two"].settings == tuned["more"].settings != tuned["code"].settings
     assert (tuned["one"].row, tuned["one"].preset, tuned["one"].tuned) == ("Mine, tuned", "dist", True)
 
 

@@ -40,13 +40,12 @@ PROBLEM_SETTINGS = {  # per set: the setting in which problems differ, its key u
 }
 BUDGET_KEY = "task.optimiser.budget"
 CUSTOM = "custom"  # the preset of renderers that a user names by their class
-TUNED_PREFIX = "tuned/"  # before the name of a method with tuned settings
 TUNED_SUFFIX = ", tuned"  # after the name of a row with tuned settings
 NOISE_KEY = "task.optimiser.start_noise"
 SECOND_START_NOISE = 1e-6  # standard deviation of the noise in the initial parameters of a second start
 SECOND_SUFFIX = ", second start"  # after the name of its row
-TUNABLE_KEYS = r"silhouette|task\.(losses|code|\w+_weight|optimiser\.learning_rate)\b"
-# A set fixes these for all renderers; tuned settings may only change TUNABLE_KEYS.
+RATE_KEY, ITERATIONS_KEY = "task.optimiser.learning_rate", "task.optimiser.afforded_iterations"  # tuned settings
+# A set fixes these for all renderers; tuned settings may only change RATE_KEY and ITERATIONS_KEY.
 FIXED_KEYS = ("task", "view", "evaluation", "silhouette", "field", "prior", "split", "seed")
 
 
@@ -59,6 +58,7 @@ class Suite:
     sizes: dict[str, str]
     errors: dict[str, str]
     units: dict[str, float]
+    candidates: dict[str, tuple[float, int]]
     references: dict[str, dict[str, float]]
 
     @property
@@ -143,9 +143,13 @@ class Attempt:
         return self.row.endswith(TUNED_SUFFIX)
 
 
-def attempts_of(records: Iterable[Record], results_dir: Path) -> list[Attempt]:
-    """The attempts among the records of a results folder; planned runs are none."""
-    return [attempt for record in records if (attempt := _attempt(record, results_dir / "runs" / record["folder"]))]
+def attempts_of(records: Iterable[Record], results_dir: Path, split: str = "test") -> list[Attempt]:
+    """The attempts among the records of a results folder; planned runs and those of other splits are none."""
+    folder = results_dir / "runs"
+    attempts = (
+        _attempt(record, folder / record["folder"]) for record in records if record["config"].get("split") == split
+    )
+    return [attempt for attempt in attempts if attempt]
 
 
 def newest_attempts(attempts: Iterable[Attempt]) -> list[Attempt]:
@@ -168,11 +172,10 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
     amount_texts = [form.format(setting(config, *amount_key.split(".")))] if amount_key else []
     final, start = (_error(record[section].get(error)) for section in ("metrics", "metrics_start"))
     curve, spent = _curve(folder, error, final if ok else None)
-    tuned = str(record.get("method") or "").startswith(TUNED_PREFIX)
     overrides = [text.lstrip("+") for text in record.get("overrides", ()) if not config.get("label")]
     changes = [text.removeprefix("renderer.") for text in overrides if re.match(r"renderer\.[^_]", text)]
     row = ", ".join([renderer_name(config, record["renderer"]), *changes])  # without the loss, which is the set's
-    suffix = SECOND_SUFFIX if noise else TUNED_SUFFIX if tuned else ""
+    tuned, suffix = row.endswith(TUNED_SUFFIX), SECOND_SUFFIX if noise else ""
     return Attempt(
         set=set_name,
         problem=", ".join([scene, *amount_texts]),
@@ -215,9 +218,7 @@ def settings_hash(config: dict[str, Any], set_name: str, tuned: bool) -> str:
     """A hash of the settings that a set fixes, without those in which problems or tuned settings differ."""
     values = flat({key: config.get(key) for key in FIXED_KEYS})
     amount_key, *_ = PROBLEM_SETTINGS.get(set_name, ("",))
-    varying = [
-        key for key in values if key in (amount_key, BUDGET_KEY, NOISE_KEY) or (tuned and re.match(TUNABLE_KEYS, key))
-    ]
+    varying = {amount_key, BUDGET_KEY, NOISE_KEY, *((RATE_KEY, ITERATIONS_KEY) if tuned else ())}
     return digest({key: str(value) for key, value in values.items() if key not in varying})
 
 
@@ -236,13 +237,16 @@ def _rounded(number: float) -> float:
     return float(f"{number:.5g}")
 
 
-def attempts_folder(results_dir: Path) -> Path:
-    return results_dir / SUITE_FOLDER / suite().id
+def attempts_folder(results_dir: Path, subfolder: str = "") -> Path:
+    return results_dir / SUITE_FOLDER / suite().id / subfolder
 
 
-def write_attempts(attempts: Iterable[Attempt], results_dir: Path) -> list[Path]:
+def write_attempts(attempts: Iterable[Attempt], results_dir: Path, subfolder: str = "") -> list[Path]:
     """Merges attempts into those of a results folder; returns a file per row. Raises ValueError for a damaged file."""
-    folder, (stored, problems) = attempts_folder(results_dir), read_attempts(results_dir)
+    folder, (stored, problems) = (
+        attempts_folder(results_dir, subfolder),
+        read_attempts(results_dir, subfolder=subfolder),
+    )
     if problems:
         raise ValueError(
             f"{folder} has files that cannot be read: {'; '.join(problems)}. Repair them or move them away."
@@ -277,10 +281,14 @@ def _value(cell: str, kind: Any) -> Any:
     return cell if kind is str else from_json_values(json.loads(cell))
 
 
-def read_attempts(*folders: Path) -> tuple[list[Attempt], list[str]]:
-    """Reads the attempts of results folders; also returns a message for each file that cannot be read."""
+def read_attempts(*folders: Path, subfolder: str = "") -> tuple[list[Attempt], list[str]]:
+    """Reads the attempts of results folders; also returns a message for each file that cannot be read.
+
+    Args:
+        subfolder: the folder of attempts that are not on the suite's problems; empty: those that are.
+    """
     attempts, problems = list[Attempt](), list[str]()
-    for path in (path for folder in folders for path in sorted(attempts_folder(folder).glob("[!.]*.csv"))):
+    for path in (path for folder in folders for path in sorted(attempts_folder(folder, subfolder).glob("[!.]*.csv"))):
         try:
             attempts += _read_lines(path, path.stat().st_mtime_ns)
         except READ_ERRORS as error:
