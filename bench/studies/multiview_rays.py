@@ -9,19 +9,21 @@ from bench.report.study import Runs, Selection, condition_curves, statistics
 PLACE = 51
 RAYS = "view.rays_per_pixel"
 READS = (Selection("multiview_rays", (RAYS,), setup=Selection.WITHOUT_MACHINE),)
+CONTROL_ROWS = tuple(f"multiview_area_{kind}{name}" for kind in ("fraction", "centre") for name in ("", "_neus"))
 MASK_ROWS = tuple(f"multiview_mask{name}" for name in ("", "_neus", "_opaque", "_volsdf", "_unisurf"))
 NOTES = (
     "A prior's code is fitted, from a random code, to the colours and silhouettes of 12 photographs of 32 x 32 pixels. "
-    "With 4 rays, the mean colour of a pixel is compared, if all of its rays hit and the neighbouring photograph sees "
-    "at least half of their points.",
+    "With several rays, the mean colour of a pixel is compared, if all of its rays hit and the neighbouring photograph "
+    "sees at least half of their points.",
     "All runs have the same budget of field evaluations. An iteration draws a pixel of each block of 1, 2, 4 or 8 "
-    "pixels per side: the smallest block with which the budget pays for 40 iterations. With 4 rays blocks are larger, "
-    "so an iteration compares fewer pixels, and a run may have more iterations.",
-    "With 1 ray, the observation of a pixel is its mask at the centre. With 4, it is the fraction that the shape "
-    "covers. So a ratio also contains the change of the observation.",
+    "pixels per side: the smallest block with which the budget pays for 40 iterations. With several rays, blocks "
+    "are larger, so an iteration compares fewer pixels, and a run may have more iterations.",
+    "With 1 ray, the observation of a pixel is its mask at the centre. With 4 and 16, it is the fraction that the "
+    "shape covers. So a ratio also contains the change of the observation. Rows with mask or fraction in their name "
+    "keep that observation for any number of rays. With fraction, a single ray goes through a random point.",
     "Rows with area in their name compare a pixel's mean opacity with the fraction of it that the shape covers. The "
-    "other rows, also of volume renderers, have DIST's mask loss. With 4 rays of which the shape covers a fraction k, "
-    "k of the rays should hit. The figure and the verdict leave them out.",
+    "other rows, also of volume renderers, have DIST's mask loss. Of n rays in a pixel of which the shape covers a "
+    "fraction k, k n should hit. The figure and the verdict leave them out.",
     "The weights of the two losses were chosen on four validation shapes, for the relaxed boundary and NeuS: of 1, 10, "
     "100 and 1000 for areas with 4 rays, and of 1, 10 and 100 for masks with 1 ray.",
     "A run that is not ok counts with its result, if it has one. With `not_reached`, its loss did not fall.",
@@ -57,6 +59,6 @@ PAGES = {
         question="At equal cost, do several rays per pixel lower the error of a shape from many views?",
         verdict="Chamfer-L1 with 4 rays per pixel over that with 1, at equal cost",
         notes=notes,
-        only_in_table=MASK_ROWS,
+        only_in_table=(*MASK_ROWS, *CONTROL_ROWS),
     )
 }

@@ -69,6 +69,8 @@ class Multiview:
         optimiser: iterations and learning rates.
         pixel_block: see `bench.tasks.completion.Completion`; of each compared view.
         encoder: gives the mean of the initial codes, averaged over the photographs; None: zero, the mean shape.
+        fractions: whether the silhouette loss compares fractions of pixels that the shape covers, with random rays, or
+            masks of their centres. None: fractions with several rays per pixel.
     """
 
     images: Photography
@@ -95,6 +97,7 @@ class Multiview:
     optimiser: OptimiserSettings
     pixel_block: int = 1
     encoder: CodeEncoder | None = None
+    fractions: bool | None = None
 
     takes_rays_per_pixel: ClassVar[bool] = True
 
@@ -124,6 +127,10 @@ class Multiview:
     def start_settings(self) -> StartSettings:
         """The number of starts, and the iterations of each start's trial."""
         return StartSettings(self.starts, self.trial)
+
+    def compares_fractions(self, rays_per_pixel: int) -> bool:
+        """Whether the silhouette loss compares fractions of pixels."""
+        return rays_per_pixel > 1 if self.fractions is None else self.fractions
 
     def check(self, inputs: RunInputs) -> None:
         """Raises BadInput without a prior."""
@@ -158,7 +165,7 @@ class Multiview:
         scene_seed = scene.seed(seed)  # so that each shape has another texture and other codes
         generator = torch.Generator().manual_seed(scene_seed)
         rays, camera = scene.rays_per_pixel, scene.view.camera.zoomed(self.focal)
-        areas = rays > 1 and self.silhouette_weight > 0
+        areas = self.compares_fractions(rays) and self.silhouette_weight > 0
         photographs = self.images.take(scene.raycaster, camera, seed=scene_seed, areas=areas)
         loss = PhotometricLoss(self, renderer, photographs, device, seed=scene_seed, rays_per_pixel=rays)
         return self.problem_of(prior, loss, generator)
@@ -222,7 +229,8 @@ class PhotometricLoss:
             BadInput: if photographs differ in size.
         """
         self.settings, self.renderer, self.from_user, self.seed = settings, renderer, from_user, seed
-        self.rays_per_pixel = rays_per_pixel
+        self.rays_per_pixel, fractions = rays_per_pixel, settings.compares_fractions(rays_per_pixel)
+        self.random_rays = rays_per_pixel > 1 or fractions  # else they go through the centres of pixels
         if len({photograph.colours.shape for photograph in photographs}) > 1:
             raise BadInput("task=multiview compares photographs of one size, and these differ: leave others out")
         self.cameras = [photograph.camera.to(device) for photograph in photographs]
@@ -231,7 +239,7 @@ class PhotometricLoss:
         self.per_step = min(settings.views_per_step, len(photographs))
         count = len(photographs)
         masks = [
-            shot.covered if rays_per_pixel > 1 else shot.mask
+            shot.covered if fractions else shot.mask
             for shot in photographs
             if settings.silhouette_weight and shot.mask is not None
         ]
@@ -240,7 +248,7 @@ class PhotometricLoss:
             centres = torch.stack([camera.center for camera in self.cameras])
             nearest = torch.cdist(centres, centres).argsort(dim=1)  # the first is the view itself
             self.neighbours = nearest[:, min(settings.neighbour, count - 1)].tolist()
-        self.masks = torch.stack(masks).to(device) if masks else None  # with several rays per pixel, fractions
+        self.masks = torch.stack(masks).to(device) if masks else None  # or fractions
         pixels = torch.ones(self.colours.shape[1:3], dtype=torch.bool)
         self.draw = PixelDraw(pixels, settings.pixel_block, seed)  # the same in each view
 
@@ -268,7 +276,7 @@ class PhotometricLoss:
         renderer, images = at_iteration(self.renderer, iteration), self.images_at(iteration)
         views, neighbours = map(list, zip(*self.pairs(iteration), strict=True))
         observed = images[views]
-        if several := self.rays_per_pixel > 1:
+        if self.random_rays:
             rays = random_rays_of([self.cameras[view] for view in views], self.rays_per_pixel, self.seed, iteration)
         else:
             rays = self._stack_rays(views)
@@ -282,12 +290,12 @@ class PhotometricLoss:
         differences = []
         for k, other in enumerate(neighbours):
             shown = compared = visible[k]
-            if several:
+            if self.random_rays:
                 shown = rendering.hit[k].all(-1) & (2 * visible[k].sum(-1) >= self.rays_per_pixel)
                 compared = visible[k] & shown[..., None]
             pixels, _ = self.cameras[other].project(rendering.points[k][compared])
             warped, inside = sample(images[other], pixels)
-            if several and len(warped):  # the neighbour sees these points, so they are inside
+            if self.random_rays and len(warped):  # the neighbour sees these points, so they are inside
                 warped, inside = torch.segment_reduce(warped, "mean", lengths=compared[shown].sum(-1)), slice(None)
             differences.append((warped - observed[k][shown])[inside].abs().mean(-1))
         errors = torch.cat(differences)
@@ -298,7 +306,10 @@ class PhotometricLoss:
         if self.masks is not None:
             masks = self.masks[views].flatten(1)[:, drawn] if is_drawn else self.masks[views]
             unknown = torch.full_like(masks, torch.nan, dtype=rendering.distance.dtype)
-            observation = observation_of(masks, unknown, rendering) if several else RayObservation(masks, unknown)
+            if self.random_rays:
+                observation = observation_of(masks.to(unknown), unknown, rendering)
+            else:
+                observation = RayObservation(masks, unknown)
             silhouette = self.settings.silhouette(renderer, field, rays, rendering, observation)
             terms["silhouette"] = self.settings.silhouette_weight * silhouette
         return terms
