@@ -1,7 +1,7 @@
 """The suite: progress of each renderer at equal costs, significant differences, and its progress in each set."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -21,7 +21,8 @@ from bench.report.suite.attempts import (
     gather,
     suite,
 )
-from bench.report.suite.standing import ALPHA, KEY, MAX_LEVEL, Ranking, Standing, units
+from bench.report.suite.standing import ALPHA, KEY, MAX_LEVEL, Standing, units
+from bench.report.suite.verdicts import leaders
 from bench.report.write import paper
 from bench.report.write.table import percent
 
@@ -59,11 +60,7 @@ PROGRESS = (
     "as significant. The sample is of these four families.",
 )
 
-TUNED = (
-    "Tuned: the settings of conf/tuned.yaml, chosen on validation shapes. They may have another silhouette loss. The "
-    "effects of settings and loss are not separated."
-)
-MAX_NAMED = 4  # rows in a verdict; the table has the ranks of all
+TUNED = "Tuned: each renderer with its own learning rate and rays, chosen on validation shapes."
 
 
 def make(*several: Runs | None) -> Result:
@@ -285,34 +282,6 @@ def verdict(made: Standing) -> str:
             rows = f"{len(ranked.progress)} renderers" + ("" if ranked.level else ", whatever their results")
             parts.append(f"At {units(budget)}, {scenes} cannot decide between {rows}.")
     return " ".join([*parts, failures(made)])
-
-
-def leaders(ranked: Ranking, when: str) -> str:
-    """The rows that no row significantly beats, if they beat all others; else the first row."""
-    beaten = {second for _, second in ranked.better}
-    first = [row for row in ranked.progress if row not in beaten]
-    names = short_names(ranked.progress)
-    rows = [f"{names[row]} (*{percent(ranked.progress[row])}*)" for row in first]
-    if beaten and all((row, other) in ranked.better for row in first for other in beaten):
-        more = f"significantly more progress than {format.plural(len(beaten), 'other')}"
-        if len(first) == 1:
-            return f"{when}, {rows[0]} makes {more}."
-        return f"{when}, {', '.join(rows[:-1])} and {rows[-1]} make {more}."
-    behind = [row for row in ranked.progress if (first[0], row) in ranked.better]
-    tied = [row for row in ranked.progress if row not in (first[0], *behind)]
-    less = f"{format.plural(len(behind), 'other')}: {', '.join(names[row] for row in behind)}"
-    if len(behind) > len(tied) > 0:
-        others = ", ".join(names[row] for row in tied) if len(tied) <= MAX_NAMED else str(len(tied))
-        return f"{when}, {rows[0]} makes significantly more progress than all but {others}."
-    than = f"significantly more than {less}" if behind else "and cannot be distinguished from any other"
-    return f"{when}, {rows[0]} makes the most progress, {than}."
-
-
-def short_names(rows: Iterable[str]) -> dict[str, str]:
-    """The names of rows without their settings, where that leaves them different."""
-    first = {row: row.partition(",")[0] for row in rows}
-    count = Counter(first.values())
-    return {row: name if count[name] == 1 else row for row, name in first.items()}
 
 
 def failures(made: Standing) -> str:

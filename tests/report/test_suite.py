@@ -44,7 +44,9 @@ from bench.report.suite.standing import (
     with_progress,
 )
 from bench.report.suite.tuned import CANDIDATES, setting_overrides, stated_rate
+from bench.report.suite.verdicts import leaders
 from bench.studies import suite as study
+from bench.studies import suite_tuned
 from bench.suite import _expected_runtime, _sweeps, main, parse_arguments, print_standing
 from bench.tables import choice
 from tests.looped import each
@@ -258,7 +260,7 @@ def test_problems_that_the_reference_row_lacks_are_not_compared():
 def test_the_answer_names_who_leads_by_a_rule(better, said):
     pairs = {tuple(pair) for pair in better.split()}
     ranked = Ranking(dict(zip("ABCD", (0.9, 0.8, 0.7, 0.6), strict=True)), pairs, 6, 0.01, 16)
-    assert study.leaders(ranked, "Here").removeprefix("Here, ").startswith(said)
+    assert leaders(ranked, "Here").removeprefix("Here, ").startswith(said)
 
 
 def test_kept_attempts_are_read_as_they_were_and_joined_in_any_order(tmp_path):
@@ -418,6 +420,31 @@ def test_each_renderer_has_the_candidate_that_is_best_on_validation_shapes(tmp_p
     assert "complete, newton: the set's setting is the best" in capsys.readouterr().out
     ((_, keys),) = _sweeps(*parse_arguments([*arguments, "renderer=custom", "label=Mine"]), tmp_path)
     assert {"renderer=custom", "label='Mine, tuned'", "+task.optimiser.afforded_iterations=160"} < {*keys}
+
+
+def test_with_its_own_setting_each_renderer_is_compared_on_the_same_problems(tmp_path, monkeypatch):
+    """B has a better setting than that of the set, and Dist has not; C has no candidates."""
+    stated = made([("Dist", 0.011, 100.0), ("B", 0.1, 100.0), ("C", 0.02, 100.0)], TEN)
+    tuned = [
+        attempt(f"{row}, tuned", scene, {0: 1.0, 9: final}, settings="own", preset=row.lower())
+        for row, final in (("B", 0.01), ("Dist", 0.5))
+        for scene in TEN
+    ]
+    candidates = [
+        replace(attempt(row, "vase validation 0", {0: 9.0, 9: error}, settings=name), overrides=changes)
+        for row, errors in {"Dist": [1, 2, 3, 4], "B": [2, 1, 3, 4]}.items()
+        for name, error in zip(suite().candidates, errors, strict=True)
+        for changes in [setting_overrides("complete", name)]
+    ]
+    write_attempts(candidates, tmp_path / "shipped", CANDIDATES)
+    page([*stated, *tuned], tmp_path, monkeypatch)
+    nothing = [None] * (len(study.READS) - 1)
+    result = suite_tuned.make(Runs(study.READS[0], tmp_path / "none", []), *nothing)
+    assert [(line["row"], line["complete"]) for line in result.lines] == [("B", "slower"), ("Dist", "stated")]
+    of_b, of_dist = ((line["stated"], line["own"]) for line in result.lines)
+    assert of_b[0] < 0.6 < of_b[1] and min(of_dist) > 0.95  # without stated references, the best row decides
+    assert result.figure is not None
+    assert "correlation of both orders is -1.00" in result.verdict and "1 of complete" in " ".join(result.remarks)
 
 
 def test_candidates_are_the_same_for_all_renderers_on_validation_shapes():
@@ -580,7 +607,7 @@ def test_a_budget_with_only_some_of_the_sets_names_them(tmp_path, monkeypatch):
 def test_without_anything_to_compare_both_pages_are_empty(tmp_path, monkeypatch):
     page([], tmp_path, monkeypatch)
     runs = [None] * (len(study.READS) - 1)
-    for make in study.PAGES.values():
+    for make in (*study.PAGES.values(), suite_tuned.make):
         result = make(Runs(study.READS[0], tmp_path / "none", []), *runs)
         assert (result.verdict, len(result.lines)) == ("", 0)
 

@@ -18,7 +18,6 @@ from bench.report.suite.attempts import (
     ITERATIONS_KEY,
     RATE_KEY,
     Attempt,
-    attempts_folder,
     read_attempts,
     suite,
 )
@@ -58,10 +57,19 @@ def renderer_of(attempt: Attempt) -> str:
     return attempt.row if attempt.preset == CUSTOM else attempt.preset
 
 
-def candidate_errors(attempts: Iterable[Attempt]) -> pd.DataFrame:
+def candidate_runs(folders: Iterable[Path]) -> list[Attempt]:
+    """The attempts of candidates in results folders, the later ones last. Raises ValueError for a damaged file."""
+    attempts, problems = read_attempts(*folders, subfolder=CANDIDATES)
+    if problems:
+        raise ValueError(f"runs of candidates cannot be read: {'; '.join(problems)}")
+    return attempts
+
+
+def candidate_errors(attempts: Iterable[Attempt]) -> tuple[pd.DataFrame, dict[str, int]]:
     """Geometric means of the final errors on validation shapes, a column per candidate, by budget, set and renderer.
 
-    A failed run counts with its initial error. Problems that lack a candidate are left out.
+    A failed run counts with its initial error. Problems that lack a candidate are left out. Also returns the smallest
+    number of problems of a renderer, by set.
     """
     lines = [
         {
@@ -74,19 +82,12 @@ def candidate_errors(attempts: Iterable[Attempt]) -> pd.DataFrame:
     frame = pd.DataFrame(lines, columns=[*KEY, "problem", "candidate", "error"])
     table = frame.pivot_table(index=[*KEY, "problem"], columns="candidate", values="error", aggfunc="last")
     table = table.reindex(columns=[*suite().candidates]).dropna()
-    return np.exp(table.groupby(KEY).mean())
+    counts = table.groupby(KEY).size().groupby("set").min()
+    return np.exp(table.groupby(KEY).mean()), counts.to_dict()
 
 
 def chosen_settings(*folders: Path) -> dict[tuple[float, str, str], str]:
-    """The best candidate by budget, set and renderer; of later folders, if they have one. Raises ValueError."""
-    chosen = dict[tuple[float, str, str], str]()
-    for folder in folders:
-        attempts, problems = read_attempts(folder, subfolder=CANDIDATES)
-        if problems:
-            raise ValueError(
-                f"{attempts_folder(folder, CANDIDATES)} has files that cannot be read: {'; '.join(problems)}"
-            )
-        errors = candidate_errors(attempts)
-        best: dict[Any, Any] = errors.idxmin(axis=1).to_dict() if len(errors) else {}
-        chosen |= best
-    return chosen
+    """The best candidate by budget, set and renderer. Raises ValueError."""
+    errors, _ = candidate_errors(candidate_runs(folders))
+    best: dict[Any, Any] = errors.idxmin(axis=1).to_dict() if len(errors) else {}
+    return best

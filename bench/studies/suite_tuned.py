@@ -1,0 +1,151 @@
+"""The suite with each renderer's own learning rate and rays, compared with the settings that a set has for all."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from bench.report.study import Result, Runs, Selection, figure_style, format, merge_runs, statistics, table
+from bench.report.suite.attempts import EXPERIMENT_PREFIX, PROBLEM_SETTINGS, TUNED_SUFFIX, Attempt, gather, suite
+from bench.report.suite.standing import ALPHA, Gathered, Standing, units
+from bench.report.suite.tuned import CANDIDATES, STATED, candidate_errors, candidate_runs, chosen_settings, renderer_of
+from bench.report.suite.verdicts import leaders
+from bench.report.write import paper
+from bench.report.write.table import percent
+
+PLACE = 3
+UNITS_OF_COST = 1.0
+READS = tuple(
+    Selection(f"{EXPERIMENT_PREFIX}{name}", tuple(key for key, *_ in PROBLEM_SETTINGS.values()))
+    for name in suite().errors
+)
+Chosen = dict[tuple[float, str, str], str]
+NOTES = (
+    "Candidates of a setting are the set's, a third of its learning rate (slower), three times its rate (faster), and "
+    "fewer rays for at least 160 iterations. They are the same for all renderers. The silhouette loss is the set's.",
+    "The mean logarithm of the final errors on validation shapes chooses a candidate for each renderer and set. A "
+    "failed run counts with its initial error. If the set's setting is chosen, its runs count.",
+    "Significant: as on the page of the suite, by a sign-flip test over scenes with Holm's correction over all pairs "
+    f"at {ALPHA:.0%}. Both columns have the same problems.",
+)
+
+
+def with_chosen_settings(attempts: Iterable[Attempt], chosen: Chosen) -> list[Attempt]:
+    """The attempts that have their renderer's chosen setting, under the name of its row without settings."""
+    kept = []
+    for attempt in attempts:
+        plain = replace(attempt, row=attempt.row.removesuffix(TUNED_SUFFIX), settings="")
+        setting = chosen.get((attempt.budget, attempt.set, renderer_of(plain)))
+        if setting is not None and attempt.tuned == (setting != STATED):
+            kept.append(plain)
+    return kept
+
+
+def make(*several: Runs | None) -> Result:
+    """A line per renderer: its progress with the set's settings and with its own, on the same problems."""
+    runs = merge_runs(*several)
+    gathered = gather(paper.SHIPPED, runs.results_dir, runs.records)
+    folders = (paper.SHIPPED, runs.results_dir)
+    chosen = {key: setting for key, setting in chosen_settings(*folders).items() if key[0] == UNITS_OF_COST}
+    tuned = Standing(Gathered(with_chosen_settings(gathered.everything, chosen), [], []))
+    keys = {
+        *zip(
+            tuned.complete["set"],
+            tuned.complete["problem"],
+            tuned.complete["budget"],
+            tuned.complete["row"],
+            strict=True,
+        )
+    }
+    shared = [attempt for attempt in gathered.everything if attempt.key[:4] in keys]
+    stated = Standing(Gathered(shared, [], []))
+    lines = [_line(row, tuned, stated, chosen) for row in tuned.rows] if tuned.rankings else []
+    return Result(
+        replace(runs, records=[], left_out=Counter()),
+        "The suite, with each renderer's own settings.",
+        "Progress at 1 unit of cost with the set's settings (open circles) and with a renderer's own (full circles).",
+        question="Does the order of the renderers depend on the learning rate and the rays that all of them share?",
+        verdict=verdict(tuned, stated),
+        n=_sample(tuned),
+        interval="simultaneous 95 % ranks, as on the page of the suite" if lines else "",
+        remarks=[*NOTES, *_notes(chosen, folders)] if lines else [],
+        columns=[
+            table.text("row", "Renderer"),
+            table.text("stated_text", "The set's settings"),
+            table.text("own_text", "Its own settings"),
+            *(table.text(name, name) for name in tuned.sets),
+            *(table.Column(name) for name in ("stated", "own")),
+            table.PRESET,
+        ],
+        lines=lines,
+        figure=draw(lines) if lines else None,
+    )
+
+
+def _line(row: str, tuned: Standing, stated: Standing, chosen: Chosen) -> dict[str, Any]:
+    runs = tuned.complete[tuned.complete["row"] == row]
+    first = runs.iloc[0]
+    line: dict[str, Any] = {"row": row, "preset": first["preset"]}
+    for name, standing in (("stated", stated), ("own", tuned)):
+        ranked = standing.rankings[UNITS_OF_COST]
+        line |= {name: ranked.progress[row], f"{name}_text": f"{percent(ranked.progress[row])} ({ranked.rank(row)})"}
+    return line | {name: chosen[UNITS_OF_COST, name, renderer_of(first)].replace("_", " ") for name in tuned.sets}
+
+
+def _sample(tuned: Standing) -> str:
+    scenes = format.plural(tuned.complete["scene"].nunique(), "scene")
+    problems = format.plural(len(tuned.complete.groupby(["set", "problem"])), "problem")
+    return f"{problems} of {scenes} ({', '.join(tuned.sets)}), {format.plural(len(tuned.rows), 'renderer')}"
+
+
+def verdict(tuned: Standing, stated: Standing) -> str:
+    """The leaders with their own settings, the pairs that differ in both, and the correlation of both orders."""
+    if len(tuned.rows) < 2:
+        return ""
+    ranked, before = tuned.rankings[UNITS_OF_COST], stated.rankings[UNITS_OF_COST]
+    order = list(ranked.progress)
+    rho, _ = statistics.rank_correlation([*range(len(order))], [[*before.progress].index(row) for row in order])
+    turned = sum(pair[::-1] in before.better for pair in ranked.better)
+    lead = leaders(ranked, f"With their own settings, at {units(UNITS_OF_COST)}")
+    return (
+        f"{lead} *{len(ranked.better)}* of {ranked.pairs} pairs differ, with the sets' settings {len(before.better)}; "
+        f"{turned or 'none'} of them in the other direction. "
+        f"Spearman's correlation of both orders is {rho:.2f}."
+    )
+
+
+def _notes(chosen: Chosen, folders: Sequence[Path]) -> list[str]:
+    counts = Counter(setting.replace("_", " ") for setting in chosen.values()).most_common()
+    _, of_sets = candidate_errors(candidate_runs(folders))
+    problems = ", ".join(f"{count} of {name}" for name, count in of_sets.items())
+    return [
+        f"Chosen, over renderers and sets: {', '.join(f'{name} {count} times' for name, count in counts)}.",
+        f"Validation problems per renderer: {problems}. So few problems may choose a setting by chance.",
+        f"The runs of the candidates are in the folder `{CANDIDATES}` next to those of the suite.",
+    ]
+
+
+@figure_style.styled
+def draw(lines: Sequence[dict[str, Any]]) -> Figure:
+    """Draws a row per renderer: an open circle for the set's settings, a full one for its own."""
+    figure = Figure(figsize=(figure_style.WIDTH, 0.6 + 0.3 * len(lines)), layout="constrained")
+    axis = figure.subplots()
+    for index, line in enumerate(lines):
+        colour = figure_style.look(line["preset"]).colour
+        axis.plot([line["stated"], line["own"]], [index, index], color=colour)
+        axis.plot(
+            line["stated"], index, "o", color=colour, mfc="white", label="the set's settings" if not index else None
+        )
+        axis.plot(line["own"], index, "o", color=colour, label="its own settings" if not index else None)
+    axis.set_yticks(range(len(lines)), [line["row"] for line in lines])
+    axis.invert_yaxis()
+    axis.xaxis.set_major_formatter(lambda share, _: percent(share))
+    axis.set_xlabel("progress at 1 unit of cost")
+    axis.legend()
+    return figure
+
+
+PAGES = {"suite_tuned": make}
