@@ -41,7 +41,8 @@ DEFINITIONS = {
     "field_error": "of its trial: the mean difference of colours from 0 to 1 on photographs set aside, black outside",
     "field_overhead": "seconds of all trials and of the loop over those of the loop",
     "fields_tried": "candidates that were tried",
-    "seconds.trials": "the loops of the trials of field=auto; their evaluations are not among those of the loop",
+    "field_evaluations": "field evaluations of the trials, which are not among those of the loop",
+    "seconds.trials": "the loops of the trials of field=auto",
 }
 
 
@@ -191,20 +192,24 @@ class Choice:
         return sum(trial.seconds for trial in self.trials.tried)
 
     @property
+    def evaluations(self) -> int:
+        """Field evaluations of all trials."""
+        return sum(trial.evaluations for trial in self.trials.tried)
+
+    @property
     def note(self) -> str:
         errors = ", ".join(f"{trial.candidate} {trial.mean:.3g}" for trial in self.trials.tried)
-        values = sum(trial.evaluations for trial in self.trials.tried)
         text = f"field=auto: {self.kept.candidate}, {self.kept.size.free:,} numbers"
         if self.kept.error is None:
             text += ", though no trial ended well: lower task.optimiser.learning_rate, or raise a task.optimiser.budget"
         photographs = f"{plural(self.validation_count, 'photograph')} set aside"
-        spent = f"the trials took {self.seconds:.1f} s and {values:,} values"
+        spent = f"the trials took {self.seconds:.1f} s and {self.evaluations:,} field evaluations"
         return f"{text}; error of colours on {photographs}, after the trials: {errors}; {spent}"
 
     def metrics(self, runtime: float) -> dict[str, Any]:
         """The metrics of `DEFINITIONS`, for a run with this runtime in seconds."""
-        overhead = {"field_overhead": 1 + self.seconds / max(runtime, 1e-9), "fields_tried": len(self.trials.tried)}
-        return self.kept.field() | overhead
+        costs = {"field_overhead": 1 + self.seconds / max(runtime, 1e-9), "fields_tried": len(self.trials.tried)}
+        return self.kept.field() | costs | {"field_evaluations": self.evaluations}
 
 
 def tiled(errors: Float[Tensor, " pixels"], shots: Sequence[Shot]) -> HeldOutError:

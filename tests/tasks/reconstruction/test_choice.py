@@ -83,8 +83,8 @@ def test_the_smallest_candidate_that_no_larger_one_improves_on_is_chosen(tmp_pat
     assert "small 0.3, middle 0.1, large 0.1" in choice.note
     metrics = choice.metrics(runtime=2 * choice.seconds)
     assert metrics["field_overhead"] == pytest.approx(1.5)
-    names = ("field", "field_free", "field_bytes", "fields_tried")
-    assert [metrics[name] for name in names] == ["middle", 10, 40, 3]
+    names = ("field", "field_free", "field_bytes", "fields_tried", "field_evaluations")
+    assert [metrics[name] for name in names] == ["middle", 10, 40, 3, choice.evaluations] and choice.evaluations > 0
     assert metrics["field_error"] == pytest.approx(0.1)
 
 
