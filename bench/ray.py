@@ -14,8 +14,8 @@ A ray is rendered alone, so the errors of coarse-to-fine marching do not show.
 Each renderer's derivatives of the hit distance are compared with central differences of the float64 reference. Their
 parameters are the three most sensitive ones of the latent code or the family's formula, and the object's translation
 for meshes and stresses.
-into=FILE names the picture, by default ray.png; a PDF is written too. The configuration in a run
-folder is trusted, as by `python -m bench`. A run of task=stability takes level= too.
+into=FILE names the picture, by default results/local/ray.png; a PDF is written too. The configuration in a run folder
+is trusted, as by `python -m bench`. A run of task=stability takes level= too.
 
 pixels=worst writes RUN_FOLDER/rays: a PNG for each of the 12 most wrong pixels, which lie apart, with sentences in
 rays.json. `python -m bench.report results_dir=RESULTS` then shows them on the run's page.
@@ -40,7 +40,7 @@ from bench.evaluate.reference import in_float64
 from bench.pictures.ray import LanePanel, RayPicture, draw_map
 from bench.records.format import number, plural
 from bench.records.record import bad_link, read_record, to_json, write_text
-from bench.records.results import PlannedRun
+from bench.records.results import RESULTS, PlannedRun
 from bench.report.site.rays import MAP_FILE, MAX_RAYS, RAYS_FILE, RAYS_FOLDER, ray_file
 from bench.runner.command import command_line
 from bench.runner.compose import Composer
@@ -81,7 +81,7 @@ class Options:
     pixels: str = ""
     zoom: float | None = None
     level: float | None = None
-    into: Path = Path("ray.png")
+    into: Path = Path(RESULTS) / "ray.png"
 
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[Options, list[str]]:

@@ -1,5 +1,6 @@
 """The tables and figures of the experiments, made from run folders whose numbers are known."""
 
+import html
 import json
 import shutil
 from pathlib import Path
@@ -15,7 +16,7 @@ from bench.report.data.runs import Runs, choose
 from bench.report.study import published
 from bench.report.write.html import write_index
 from bench.report.write.paper import find_paper, studies
-from bench.report.write.result import Result, Shown, latex
+from bench.report.write.result import Result, Shown, as_markdown, latex
 from bench.studies import fig4, fig5, fig7, gradients, table1
 from tests.looped import each
 from tests.report.page_data import Page
@@ -240,6 +241,27 @@ def test_hostile_words_are_escaped_everywhere(tmp_path):
     shown = next(paper.shown for paper in find_paper(tmp_path) if paper.name == "table1")
     assert shown.rows[0][0] == hostile and len(shown.rows[0]) == len(shown.columns) == 13
     assert Page(tmp_path).paper("table1")["rows"][0][0] == hostile  # reading it checks that no script can come of it
+
+
+SIGNS = r"""[a](b) @ ![a](b) @ [a]: b @ [a][b] @ [a] [b] @ a ]( b [ @ \[a](b) @ [[a](b)] @ [x] a @ `[a](b)` @ `a|b` c `
+@ a | b @ a < b &lt; <a href=b>c</a> <http://a.b> @ *a* **b** @ a\ @ `a
+
+<b>`"""
+
+
+@each("text", SIGNS.split("@"))
+def test_markdown_shows_text_without_links_images_and_html(text):
+    """In each part of a page, by a reader of CommonMark with tables."""
+    reader = pytest.importorskip("markdown_it").MarkdownIt("commonmark").enable("table")
+    escaped = as_markdown(text)
+    for part in ("a {} b", "- {}", "**{}**", "| {} | b |\n| --- | --- |\n| {} | [c](d) |\n"):
+        page = reader.render(part.replace("{}", escaped))
+        expected = reader.render(part.replace("{}", "TEXT")).replace("TEXT", html.escape(" ".join(text.split())))
+        assert page == expected
+
+
+def test_markdown_of_intervals_and_code_is_not_escaped():
+    assert as_markdown("0.5 [0.2, 0.7] and `not_reached` & a_b") == "0.5 [0.2, 0.7] and `not_reached` & a_b"
 
 
 def test_latex_has_one_sentence_powers_of_ten_dashes_and_rules_between_groups():

@@ -1,6 +1,5 @@
 """The result of a study, and its output as CSV, JSON, Markdown, LaTeX, PNG and PDF."""
 
-import html
 import json
 import re
 import textwrap
@@ -58,7 +57,10 @@ _LATEX = {
 }
 _POWER = re.compile(r"(?<![\w.-])(-?\d+(?:\.\d+)?)e\+?(-?\d+)(?!\w)")  # such as 2.2e-5
 JSON_KEYS = {"order": "place"}  # fields of Shown with another name in the shipped files
-_MARKDOWN = str.maketrans({character: f"&#{ord(character)};" for character in "|*`[]\\"})
+# Characters that Markdown or HTML would read as signs. Brackets are, where they could form a link or a check box.
+_MARKDOWN_SIGN = r"[\\`*|<]|&(?=#?\w+;)"
+_MARKDOWN_CODE = r"`[\w.=/+-]+`"  # such as `not_reached`
+_MARKDOWN_LINK = re.compile(r"\][(\[:]|\]\s*\[|^\[[ xX]\]")
 
 
 @dataclass(frozen=True)
@@ -314,8 +316,14 @@ def _tex_heading(heading: str, cells: list[str]) -> str:
 
 
 def as_markdown(text: str) -> str:
-    """A text on one line, with the special characters of Markdown and HTML escaped."""
-    return html.escape(_flat(text), quote=False).translate(_MARKDOWN)
+    """A text on one line as Markdown (CommonMark) that shows it unchanged, without links, images and HTML.
+
+    A word between backquotes is code. Brackets of intervals stay as they are.
+    """
+    text = _flat(text)
+    links = _MARKDOWN_LINK.search(text) or text.count("[") != text.count("]")
+    signs = [_MARKDOWN_CODE, _MARKDOWN_SIGN, *([r"[\[\]]"] if links else [])]
+    return re.sub("|".join(signs), lambda match: match[0] if len(match[0]) > 1 else rf"\{match[0]}", text)
 
 
 def _flat(text: str) -> str:
