@@ -208,14 +208,15 @@ def nest_keys(row: Node) -> Node:
 
 def nearest(word: str, options: list[str]) -> str:
     """A hint for the end of an error message: the names most similar to `word`, or all of them."""
-    same_last_part = [name for name in options if "." not in word and name.rsplit(".", 1)[-1] == word]
+    same_last_part = [name for name in options if name.rpartition(".")[-1] == word.rpartition(".")[-1]]
     same_folder = [name for name in options if "/" in word and name.startswith(word.rpartition("/")[0] + "/")]
     variants = [name for name in options if name.startswith(f"{word}_")]
 
     def similar(cutoff: float) -> list[str]:
         return [name for name in get_close_matches(word, same_folder or options, n=3, cutoff=cutoff) if name != word]
 
-    close = same_last_part or similar(0.85) or variants or similar(0.5)
+    first = [] if "." in word else same_last_part
+    close = first or similar(0.85) or same_last_part or variants or similar(0.5)
     if close:
         return f": did you mean {' or '.join(close)}?"
     without_variants = [name for name in options if not any(name.startswith(f"{other}_") for other in options)]

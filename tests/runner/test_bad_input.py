@@ -55,6 +55,7 @@ def assert_one_line(err: str, *words: str) -> None:
     ("experiment=table1", ("experiment is not chosen by default", "write +experiment=NAME")),
     ("dataset=meshes/cow.obj", ("unknown dataset 'meshes/cow.obj'", "dataset=mesh dataset.path=meshes/cow.obj")),
     ("+sede=1", ("unknown key 'sede'", "did you mean seed")),
+    ("dataset.index=3", ("unknown key 'dataset.index'", "did you mean index?")),
     ("xyzzy=1", ("unknown key 'xyzzy': none of ", "--cfg job shows them")),
     ("+experiment=fig10", ("unknown experiment 'fig10'", "fig10_focal", "fig10_start", "--config-dir FOLDER")),
     ("task.iterations=3", ("unknown key 'task.iterations'", "task.optimiser.iterations")),
