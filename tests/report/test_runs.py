@@ -86,6 +86,13 @@ def test_only_the_split_of_the_run_requested_last_is_read_unless_it_is_a_conditi
     assert len(read(tmp_path, conditions=("split",)).records) == 2
 
 
+def test_a_trial_at_smoke_replaces_no_run_of_a_larger_scale(tmp_path):
+    for size in ("smoke", "paper", "desk", "smoke"):
+        write_run(tmp_path, "mine", "A", settings={"scale": {"name": size}})
+        shown = [record["config"]["scale"]["name"] for record in read(tmp_path).records]
+        assert shown == ["desk" if size == "smoke" and len(list(tmp_path.glob("runs/*"))) > 1 else size]
+
+
 def test_the_newest_scene_is_one_shape_at_one_seed(tmp_path):
     for index, seed in ((0, 1), (1, 0), (1, 1), (0, 0), (1, 1)):
         write_run(tmp_path, "mine", f"A {index} {seed} {len(list(tmp_path.glob('runs/*')))}", index=index, seed=seed)

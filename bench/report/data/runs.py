@@ -217,6 +217,7 @@ class Runs:
 def choose(records: list[Record], selection: Selection, results_dir: Path) -> Runs | None:
     """The newest run of each cell of an experiment, at the scale of the run requested last; None without runs.
 
+    Runs at scale=smoke are read only if there are no others, since their numbers mean nothing.
     A cell is a row, task, split, draw, shape, view, seed and the conditions of the selection. Of a row, only runs with
     the settings requested last are read, so that no average mixes settings. On one scene nothing is averaged: there,
     rows of one name are distinguished by the settings of their renderers. Rows are in the order of their first start.
@@ -225,7 +226,7 @@ def choose(records: list[Record], selection: Selection, results_dir: Path) -> Ru
     if not candidates:
         return None
     shared = [key for key in ("scale.name", "split", *selection.alike) if key not in selection.conditions]
-    newest = max(candidates, key=requested)
+    newest = max(candidates, key=lambda run: (setting(run["config"], "scale", "name") != "smoke", requested(run)))
     wanted = [_without_conditions(newest, key, selection) for key in shared]
     same_scale = [run for run in candidates if [_without_conditions(run, key, selection) for key in shared] == wanted]
     chosen = same_scale
