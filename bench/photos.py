@@ -9,6 +9,8 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.style import SCREEN, bare, silhouette_image
+from bench.records.results import RESULTS
+from bench.tables import CONF, read_yaml
 from datasets.files.captures.frames import AXES
 from datasets.files.captures.hull import MaskFit
 from datasets.files.captures.sphere import likely_cause
@@ -57,7 +59,7 @@ def draw(capture: Capture) -> Figure:
         in_sphere = sphere_span(shot.camera.rays())[2].numpy()
         if in_sphere.any() and not in_sphere.all():
             axis.contour(in_sphere, [0.5], colors=OUTLINE_COLOUR, linewidths=0.8)
-            outline_note = "; the line is the unit sphere"
+            outline_note = "; the line is the unit sphere of a run"
     figure.suptitle(f"{capture.format}: {len(shots)} of {len(capture.shots)} photographs{outline_note}")
     if overlaps:
         for axis, index in zip(axes[1], indices, strict=True):
@@ -76,13 +78,15 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--axes", choices=tuple(AXES), default="stated", help="flipped: y and z turned round")
     parser.add_argument("--images", help="the folder of COLMAP's images, where it is not the usual one")
     parser.add_argument("--without-masks", action="store_true", help="as if there were none")
-    parser.add_argument("--into", type=Path, default=Path("photos.png"), help="the picture (default: %(default)s)")
+    into = Path(RESULTS) / "photos.png"
+    parser.add_argument("--into", type=Path, default=into, help="the picture (default: %(default)s)")
     options = parser.parse_args(arguments)
     into = options.into / "photos.png" if options.into.is_dir() else options.into.with_suffix(".png")
     try:
         into.parent.mkdir(parents=True, exist_ok=True)
         masks = not options.without_masks
-        reading = ReadSettings(options.longest, masks, options.axes, images=options.images, unchecked=True)
+        held_out = read_yaml(CONF / "task" / "_photographs.yaml")["held_out"]  # the sphere is that of a run
+        reading = ReadSettings(options.longest, masks, options.axes, held_out, options.images, unchecked=True)
         capture = read_capture(options.folder, reading)
         draw(capture).savefig(into, dpi=110)
     except (OSError, ValueError) as error:

@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
 
+from bench import photos
 from bench.photos import main
 from datasets.files import own_photographs
 from datasets.files.captures.formats.choy import _from_angles
@@ -19,7 +20,7 @@ from datasets.files.captures.frames import OPENGL
 from datasets.files.captures.hull import carve, hull_mesh, measure_mask_fit
 from datasets.files.captures.layouts import find_layout
 from datasets.files.captures.take import _same_aspect, read_image, read_shot
-from datasets.files.own_photographs import ReadSettings, read_capture
+from datasets.files.own_photographs import Capture, ReadSettings, read_capture
 from datasets.shot import Shot
 from renderers.checks import BadInput
 from tests.looped import each
@@ -260,6 +261,17 @@ def test_a_missing_image_leaves_its_camera_out(tmp_path, capsys):
     assert "9 photographs" in out and "note: no image for 1 of the cameras, such as ./train/r_4" in out
     assert int(out.split("overlap by ")[1].split("%")[0]) > 90
     assert (tmp_path / "photos.png").stat().st_size > 10_000
+
+
+def test_the_shown_sphere_is_that_of_a_run_without_the_photographs_it_holds_out(tmp_path, monkeypatch):
+    nerf(tmp_path)
+    captures: list[Capture] = []
+    draw = photos.draw
+    monkeypatch.setattr(photos, "draw", lambda capture: captures.append(capture) or draw(capture))
+    assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 0
+    of_run, of_all = (read_capture(tmp_path, ReadSettings(128, held_out=held_out)) for held_out in (8, None))
+    (shown,) = captures
+    assert np.array_equal(shown.to_world, of_run.to_world) and not np.array_equal(shown.to_world, of_all.to_world)
 
 
 def test_the_photographs_that_fit_worst_are_named(tmp_path, capsys):
