@@ -49,7 +49,7 @@ from bench.runner.summary import print_statuses
 from bench.runner.sweep import run_sweep
 from bench.tables import nearest
 
-PAGE = "suite"  # its file name in the folder `paper`
+PAGE, TUNED_PAGE = "suite", "suite_tuned"  # their file names in the folder `paper`
 FINISHED_EXIT_STATUSES = (0, 1)  # the sweep has ended, though runs may have failed
 STATED_KEYS_PATTERN = rf"[+~]*(({'|'.join([*FIXED_KEYS, 'sizes', 'scale', 'models', 'effort'])})(\W|$)|dataset\.)"
 AXES = (*(key for key, _, _ in PROBLEM_SETTINGS.values()), NOISE_KEY)  # may be typed: some problems, a second start
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str]) -> int:
             code = command_line(run_one, lambda composer, config: run_sweep(composer, config, print_statuses))
             if code not in FINISHED_EXIT_STATUSES:
                 return code
-        return 0 if "plan=true" in map(str.lower, overrides) else print_standing(results_dir)
+        return 0 if "plan=true" in map(str.lower, overrides) else print_standing(results_dir, options["setting"])
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -197,13 +197,14 @@ def _tuned_sweeps(
     return sweeps
 
 
-def print_standing(results_dir: Path) -> int:
+def print_standing(results_dir: Path, setting: str = STATED) -> int:
     """Stores the attempts of a results folder, writes the suite's pages, and prints a line per row."""
+    pages = [PAGE] if setting == STATED else [PAGE, TUNED_PAGE]
     with page_lock(results_dir):
         records, unread = read_records(results_dir)
         write_attempts(attempts_of(records, results_dir), results_dir)
         write_attempts(attempts_of(records, results_dir, VALIDATION), results_dir, CANDIDATES)
-        written = paper.write_paper(records, results_dir, only=PAGE)
+        written = [path for name in pages for path in paper.write_paper(records, results_dir, only=name)]
         index = write_page(records, unread, results_dir, MAX_MESHES)
     gathered = gather(paper.SHIPPED, results_dir)
     for problem in gathered.problems:

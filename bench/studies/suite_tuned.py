@@ -3,13 +3,22 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from bench.report.study import Result, Runs, Selection, figure_style, format, merge_runs, statistics, table
-from bench.report.suite.attempts import EXPERIMENT_PREFIX, PROBLEM_SETTINGS, TUNED_SUFFIX, Attempt, gather, suite
+from bench.report.suite.attempts import (
+    EXPERIMENT_PREFIX,
+    PROBLEM_SETTINGS,
+    TUNED_SUFFIX,
+    Attempt,
+    attempts_folder,
+    gather,
+    suite,
+)
 from bench.report.suite.standing import ALPHA, Gathered, Standing, units
 from bench.report.suite.tuned import CANDIDATES, STATED, candidate_errors, candidate_runs, chosen_settings, renderer_of
 from bench.report.suite.verdicts import leaders
@@ -18,6 +27,7 @@ from bench.report.write.table import percent
 
 PLACE = 3
 UNITS_OF_COST = 1.0
+KEEPS = partial(attempts_folder, subfolder=CANDIDATES)
 READS = tuple(
     Selection(f"{EXPERIMENT_PREFIX}{name}", tuple(key for key, *_ in PROBLEM_SETTINGS.values()))
     for name in suite().errors
