@@ -19,8 +19,16 @@ from bench.report.suite.attempts import (
     gather,
     suite,
 )
-from bench.report.suite.standing import ALPHA, Gathered, Standing, units
-from bench.report.suite.tuned import CANDIDATES, STATED, candidate_errors, candidate_runs, chosen_settings, renderer_of
+from bench.report.suite.standing import ALPHA, KEY, Gathered, Standing, units
+from bench.report.suite.tuned import (
+    CANDIDATES,
+    STATED,
+    candidate_errors,
+    candidate_of,
+    candidate_runs,
+    chosen_settings,
+    renderer_of,
+)
 from bench.report.suite.verdicts import leaders
 from bench.report.write import paper
 from bench.report.write.table import percent
@@ -49,7 +57,7 @@ def with_chosen_settings(attempts: Iterable[Attempt], chosen: Chosen) -> list[At
     for attempt in attempts:
         plain = replace(attempt, row=attempt.row.removesuffix(TUNED_SUFFIX), settings="")
         setting = chosen.get((attempt.budget, attempt.set, renderer_of(plain)))
-        if setting is not None and attempt.tuned == (setting != STATED):
+        if setting == (candidate_of(attempt) if attempt.tuned else STATED):
             kept.append(plain)
     return kept
 
@@ -61,15 +69,7 @@ def make(*several: Runs | None) -> Result:
     folders = (paper.SHIPPED, runs.results_dir)
     chosen = {key: setting for key, setting in chosen_settings(*folders).items() if key[0] == UNITS_OF_COST}
     tuned = Standing(Gathered(with_chosen_settings(gathered.everything, chosen), [], []))
-    keys = {
-        *zip(
-            tuned.complete["set"],
-            tuned.complete["problem"],
-            tuned.complete["budget"],
-            tuned.complete["row"],
-            strict=True,
-        )
-    }
+    keys = {*tuned.complete[[*KEY, "row"]].itertuples(index=False, name=None)}
     shared = [attempt for attempt in gathered.everything if attempt.key[:4] in keys]
     stated = Standing(Gathered(shared, [], []))
     lines = [_line(row, tuned, stated, chosen) for row in tuned.rows] if tuned.rankings else []

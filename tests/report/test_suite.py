@@ -426,8 +426,11 @@ def test_with_its_own_setting_each_renderer_is_compared_on_the_same_problems(tmp
     """B has a better setting than that of the set, and Dist has not; C has no candidates."""
     stated = made([("Dist", 0.011, 100.0), ("B", 0.1, 100.0), ("C", 0.02, 100.0)], TEN)
     tuned = [
-        attempt(f"{row}, tuned", scene, {0: 1.0, 9: final}, settings="own", preset=row.lower())
-        for row, final in (("B", 0.01), ("Dist", 0.5))
+        replace(
+            attempt(f"{row}, tuned", scene, {0: 1.0, 9: final}, settings=candidate, preset=row.lower()),
+            overrides=setting_overrides("complete", candidate),
+        )
+        for row, candidate, final in (("B", "slower", 0.01), ("B", "faster", 0.9), ("Dist", "slower", 0.5))
         for scene in TEN
     ]
     candidates = [

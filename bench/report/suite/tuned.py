@@ -46,10 +46,11 @@ def setting_overrides(set_name: str, candidate: str) -> list[str]:
 
 
 def candidate_of(attempt: Attempt) -> str:
-    """The candidate whose overrides an attempt has."""
+    """The candidate whose overrides an attempt has; empty if there is none."""
     keys = (RATE_KEY, f"+{ITERATIONS_KEY}")
     changes = [text for text in attempt.overrides if text.partition("=")[0] in keys]
-    return next(name for name in suite().candidates if {*setting_overrides(attempt.set, name)} == {*changes})
+    names = (name for name in suite().candidates if {*setting_overrides(attempt.set, name)} == {*changes})
+    return next(names, "")
 
 
 def renderer_of(attempt: Attempt) -> str:
