@@ -38,7 +38,7 @@ def draw_breakdown(folder: Path, trials: list[Trial], unit: str, title: str) -> 
         name, text, images = "works" if trial.outcome.success else "breaks", _text(trial, unit), trial.outcome.images
         arrays |= {f"{name}_severity": np.array(trial.severity)} | {f"{name}_{key}": images[key] for key in images}
         pictures |= {name: _thumbnail(images["kinds"]), f"{name}_text": text}
-        line.suptitle(f"{text}: {_counts(images['kinds'])}", fontsize=10)
+        line.suptitle(text, fontsize=10)
         _draw_line(line, images)
     figure.suptitle(title)
     save(figure, folder / "failure.png")
@@ -54,12 +54,6 @@ def _text(trial: Trial, unit: str) -> str:
     return f"fails at {severity} ({PIXEL_NAMES.get(kind, kind)})"
 
 
-def _counts(kinds: np.ndarray) -> str:
-    """The number of pixels of each kind that occurs."""
-    counts = {name: int((kinds == index).sum()) for index, name in enumerate(PIXELS)}
-    return ", ".join(f"{PIXEL_NAMES.get(name, name)} {count:,}" for name, count in counts.items() if count) + " pixels"
-
-
 def _draw_line(figure: SubFigure, images: dict[str, np.ndarray]) -> None:
     rendered_axis, true_axis, kinds_axis = figure.subplots(1, 3)
     true_distance = images["true_distance"]
@@ -67,7 +61,7 @@ def _draw_line(figure: SubFigure, images: dict[str, np.ndarray]) -> None:
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     for axis, name, heading in ((rendered_axis, "distance", "rendered"), (true_axis, "true_distance", "truth")):
         shown = axis.imshow(images[name], cmap="viridis", vmin=low, vmax=max(high, low + 1e-6))
-        axis.set_title(f"distance, {heading} (white: no hit)")
+        axis.set_title(f"distance along the ray, {heading}")
         bare(axis)
     figure.colorbar(shown, ax=[rendered_axis, true_axis], shrink=0.7, label="scene units")
     kinds_axis.imshow(images["kinds"], cmap=ListedColormap(list(PIXELS.values())), vmin=-0.5, vmax=len(PIXELS) - 0.5)

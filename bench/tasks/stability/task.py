@@ -13,7 +13,7 @@ from bench.tasks.stability import fit, judge
 from bench.tasks.stability.axes import Stress
 from bench.tasks.stability.distortions import NETWORK_DISTORTIONS
 from bench.tasks.stability.picture import draw_breakdown
-from bench.tasks.stability.search import Bisection, Breakdown, Search, SearchSettings
+from bench.tasks.stability.search import Bisection, Search, SearchSettings
 from bench.tasks.stability.trial import Conditions, Criteria, Failure, FitSettings, Trial
 from datasets.scene import HasNetwork
 from renderers.checks import BadInput, check_at_least
@@ -93,22 +93,10 @@ class Stability:
         record.metrics = self._metrics(search, trials)
         record.evaluations = {"per_ray": record.metrics["evaluations_per_ray"]}
         record.status, record.reason = trials.status()
-        verdict = self._verdict(search.result())
-        record.notes = [*record.notes, verdict, *trials.warnings()]
+        record.notes = [*record.notes, *trials.warnings()]
         if around := trials.around(search.result().level):
-            title = f"{record.name}, {record.scene}: {verdict}\n{self.criteria.of_renderings}"
+            title = f"{record.name}, {record.scene}"
             record.pictures = draw_breakdown(run.folder, around, self.stress.sweep.unit, title)
-
-    def _verdict(self, breakdown: Breakdown) -> str:
-        """Where the renderer breaks, as a sentence with the unit of the sweep."""
-        sweep = self.stress.sweep
-        if breakdown.level < 0:
-            return f"it breaks already at the mildest severity, {sweep.mild:.3g} {sweep.unit}"
-        if breakdown.level > 1:
-            return f"it does not break up to the most severe, {sweep.severe:.3g} {sweep.unit}"
-        ends = [sweep.severity(end) for end in (breakdown.low, breakdown.high) if end is not None and 0 <= end <= 1]
-        interval = f" (95 % interval {' to '.join(f'{end:.3g}' for end in sorted(ends))})" if ends[1:] else ""
-        return f"it breaks at {sweep.severity(breakdown.level):.3g} {sweep.unit}{interval}"
 
     def _check(self, renderer: Renderer) -> None:
         """Raises Unsupported before the first trial if the renderer rejects the setting at the mild end."""

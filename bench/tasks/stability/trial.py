@@ -38,12 +38,6 @@ class Criteria:
         for name in ("false_hits", "scale", "surface_error"):
             check_positive(f"task.criteria.{name}", getattr(self, name), "0.01 is strict")
 
-    @property
-    def of_renderings(self) -> str:
-        """When a rendering fails, as a sentence."""
-        missed, spurious = f"{100 * (1 - self.hits):.3g} %", f"{100 * self.false_hits:.3g} %"
-        return f"fails if more than {missed} of the hits are missed or wrong, or spurious ones are more than {spurious}"
-
 
 @dataclass(frozen=True)
 class FitSettings:
