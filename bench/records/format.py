@@ -1,6 +1,8 @@
 """Formats numbers for readers: three significant digits, `∞` for infinite, `–` for missing."""
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 MISSING = "–"
 INFINITE = "∞"
@@ -33,6 +35,21 @@ def number(x: int | float | str | None, scale: float = 1.0) -> str:
 def values_in_words(values: dict[str, str]) -> str:
     """Numbers with their names, such as "12.5 before, 0.304 after"."""
     return ", ".join(f"{value} {name}" for name, value in values.items())
+
+
+def breakdown(metrics: Mapping[str, Any], sweep: Mapping[str, Any]) -> str:
+    """Where a renderer breaks under a stress, in words: a severity with its unit, or that it does not break.
+
+    Args:
+        metrics: of a finished run of task=stability.
+        sweep: its severities: `mild` and `severe`, the ends, and their `unit`.
+    """
+    if metrics["severe_successes"] * metrics["mild_trials"] > metrics["mild_successes"] * metrics["severe_trials"]:
+        return "has no breakdown: it succeeds more often at the severest severity than at the mildest"
+    words = {"mild": "breaks at the mildest severity, ", "severe": "does not break up to the severest severity, "}
+    end = "mild" if metrics["level"] < 0 else "severe" if metrics["level"] > 1 else ""
+    severity = sweep[end] if end else metrics["breakdown"]
+    return f"{words.get(end, 'breaks at ')}{number(severity)} {sweep['unit']}"
 
 
 def plural(count: int, word: str) -> str:

@@ -18,7 +18,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from filelock import FileLock
 
-from bench.records.format import number
+from bench.records.format import breakdown, number
 from bench.records.metrics import TABLE_METRICS, metric_fault
 
 SCHEMA = 1
@@ -124,6 +124,13 @@ class Record:
     @property
     def outcome(self) -> str:
         return f"{self.title}: {self.status}"
+
+    @property
+    def verdict(self) -> str:
+        """A sentence on the severity at which the renderer breaks; empty unless it is a finished stress test."""
+        if self.status != RunStatus.OK or "severe_trials" not in self.metrics:
+            return ""
+        return f"{self.scene}: {self.name} {breakdown(self.metrics, self.config['task']['stress']['sweep'])}."
 
     def compared(self) -> list[tuple[str, dict[str, str], str]]:
         """The metrics of an optimisation: heading, values by their moment, and which direction is better."""

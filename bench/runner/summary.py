@@ -24,6 +24,8 @@ CONTRACT_TEST = "python -m pytest tests/renderers/test_renderer_contract.py -k c
 def print_run_summary(folder: Path, record: Record) -> None:
     """Prints the results of a run; the last line on standard output is its folder."""
     console = Console(highlight=False)
+    if record.verdict:
+        print(record.verdict)
     if rows := record.compared():
         lines = [(label, *values.values(), better) for label, values, better in rows]
         console.print(_table(record.title, ("", *rows[0][1], "better"), lines))
@@ -99,6 +101,7 @@ def log_lines(record: Record) -> Iterator[str]:
             f"torch {machine['torch']}; kernels {machine['kernels']}"
         )
     compared = record.compared()
+    yield from filter(None, (record.verdict,))
     yield from (f"{label}: {values_in_words(values)}" for label, values, _ in compared)
     if not compared:
         yield from (f"{label}: {value}" for label, value in _measured_metrics(record))

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from bench.config import Isolation
 from bench.progress import display, notice
-from bench.records.format import number, plural, seconds
+from bench.records.format import breakdown, number, plural, seconds
 from bench.records.metrics import TABLE_METRICS, Metric
 from bench.records.record import row_name
 from bench.records.results import Plan, PlannedRun
@@ -184,13 +184,5 @@ def cell_line(folder: Path, record: dict[str, Any], overrides: str) -> str:
     shown = [(metric, metrics[name]) for name, metric in CELL_LINE_METRICS.items() if name in metrics]
     parts += [f"{metric.label} {number(value, metric.factor)}" for metric, value in shown]
     if "level" in metrics:
-        parts.append(breakdown(record))
+        parts.append(breakdown(metrics, record["config"]["task"]["stress"]["sweep"]))
     return "  ".join(text for text in [*parts, record["reason"], str(folder)] if text)
-
-
-def breakdown(record: dict[str, Any]) -> str:
-    """The breakdown of a run of the stability task, in words."""
-    level, unit = record["metrics"]["level"], record["config"]["task"]["stress"]["sweep"]["unit"]
-    if level is None or 0 <= level <= 1:
-        return f"breaks at {number(record['metrics']['breakdown'])} {unit}"
-    return "breaks at once" if level < 0 else "does not break in the sweep"

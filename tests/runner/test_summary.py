@@ -63,6 +63,27 @@ def test_the_best_possible_values_are_shown_where_they_are_known(tmp_path, capsy
     assert "Chamfer (x1000): 12.5 before, 12.5 after, 0.133 best possible" in log_lines(record)
 
 
+@each(
+    "level, successes, status, words",
+    [
+        (0.5, (5, 0), "ok", "breaks at 0.0200 scene units thick"),
+        (-0.1, (0, 0), "ok", "breaks at the mildest severity, 0.300 scene units thick"),
+        (1.1, (5, 5), "ok", "does not break up to the severest severity, 0.00100 scene units thick"),
+        (-0.1, (1, 5), "ok", "has no breakdown"),
+        (-0.1, (0, 0), "crashed", ""),
+    ],
+)
+def test_a_stress_test_begins_with_where_the_renderer_breaks(capsys, level, successes, status, words):
+    sweep = {"mild": 0.3, "severe": 0.001, "log": True, "unit": "scene units thick"}
+    config = {"label": "DIST", "task": {"stress": {"sweep": sweep}}}
+    record = Record("a", "stability", "dist", "thin_plate", 0, config, scene="thin plate", status=RunStatus(status))
+    counts = {"mild_successes": successes[0], "severe_successes": successes[1], "mild_trials": 5, "severe_trials": 5}
+    record.metrics = {"level": level, "breakdown": 0.02 if 0 < level < 1 else None} | counts
+    print_run_summary(Path(RESULTS) / "runs" / "a", record)
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith(f"thin plate: DIST {words}") if words else "breaks" not in first
+
+
 def contract_lines(out: str) -> list[str]:
     return [line for line in out.splitlines() if "contract" in line]
 
