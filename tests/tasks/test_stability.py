@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgba
 from PIL import Image
 
 from bench.config import load
 from bench.machine.limits import Limits
+from bench.pictures.style import PAPER
+from bench.records.format import number
 from bench.records.record import Record, RunStatus
 from bench.tasks.stability import picture
 from bench.tasks.stability.search import SearchSettings
@@ -137,6 +140,36 @@ def test_a_run_shows_both_sides_of_its_breakdown(tmp_path):
     assert "(missed)" in record.pictures["breaks_text"]
     small = Image.open(BytesIO(b64decode(record.pictures["breaks"].removeprefix("data:image/png;base64,"))))
     assert (np.asarray(small) == 2).sum() == missed["breaks"]
+
+
+@pytest.mark.parametrize(("renderer", "breaks"), [(CAPPED, True), (load("renderer", "idr"), False)])
+def test_the_figure_states_the_breakdown_the_criterion_and_the_failed_trials(tmp_path, monkeypatch, renderer, breaks):
+    figures = []
+    monkeypatch.setattr(picture, "save", lambda figure, path: figures.append(figure))
+    record = record_of(tmp_path, "thin_plate", renderer)
+    lines, sweep = curve_of(tmp_path), stress_named("thin_plate").sweep
+    failed = [line for line in lines if not line["success"]]
+    title, panels = figures[0].get_suptitle(), figures[0].subfigs
+    severity = record.metrics["breakdown"] if breaks else sweep.severe
+    assert f"{number(severity)} {sweep.unit}" in title and f"{len(failed)} of {len(lines)} trials failed" in title
+    assert f"{CRITERIA.hits:g} of the true hits" in title and len(panels) == 1 + breaks
+    if breaks:
+        at_level = [line for line in lines if line["severity"] == max(line["severity"] for line in failed)]
+        lost = next(line["lost"] for line in at_level if not line["success"])
+        text = panels[-1].get_suptitle()
+        assert f"{sum(not line['success'] for line in at_level)} of {len(at_level)} trial" in text
+        assert f" {lost:.0f} missed" in text
+        legend = panels[-1].axes[0].get_legend()  # of the rendered distances, in which missed pixels are white
+        assert legend is not None and legend.get_patches()[0].get_facecolor() == to_rgba(PAPER)
+
+
+def test_the_levels_of_the_pictures_are_those_that_bench_ray_draws(tmp_path):
+    """It draws the first trial of a level."""
+    record = record_of(tmp_path, "thin_plate", CAPPED)
+    firsts = {line["level"]: line["success"] for line in reversed(curve_of(tmp_path))}
+    levels = {name: record.pictures.get(f"{name}_level") for name in ("works", "breaks")}
+    assert any(levels.values())
+    assert all(firsts[float(text)] is (name == "works") for name, text in levels.items() if text)
 
 
 def test_a_small_picture_keeps_single_wrong_pixels():

@@ -7,6 +7,7 @@ from operator import attrgetter
 import numpy as np
 
 from bench.machine.limits import Limits
+from bench.records.format import breakdown, plural
 from bench.records.record import RunStatus, curve_file
 from bench.setup.inputs import RunContext, RunInputs
 from bench.tasks.stability import fit, judge
@@ -85,9 +86,10 @@ class Stability:
         with curve_file(run.folder) as write_line:
             while (index := search.next()) is not None:
                 level = float(search.levels[index])
-                outcome = self.stress.trial(renderer, level, trials.successes_at(level)[1], conditions)
+                repeat = trials.successes_at(level)[1]
+                outcome = self.stress.trial(renderer, level, repeat, conditions)
                 search.note(index, outcome.success)
-                trials.add(Trial(level, self.stress.sweep.severity(level), outcome))
+                trials.add(Trial(level, self.stress.sweep.severity(level), repeat, outcome))
                 write_line(trials.line())
                 run.progress("searching", len(trials.all), search.max_trials, None)
         record.metrics = self._metrics(search, trials)
@@ -95,8 +97,12 @@ class Stability:
         record.status, record.reason = trials.status()
         record.notes = [*record.notes, *trials.warnings()]
         if around := trials.around(search.result().level):
-            title = f"{record.name}, {record.scene}"
-            record.pictures = draw_breakdown(run.folder, around, self.stress.sweep.unit, title)
+            counts = [trials.failures_in_words(trial.level) for trial in around]
+            title = [f"{record.scene}: {record.name} {breakdown(record.metrics, vars(self.stress.sweep))}"]
+            title += [f"{trials.failures_in_words()}; a breakdown is the severity at which half of the trials fail"]
+            title += [self.criteria.of_renderings]
+            unit = self.stress.sweep.unit
+            record.pictures = draw_breakdown(run.folder, around, counts, unit=unit, title="\n".join(title))
 
     def _check(self, renderer: Renderer) -> None:
         """Raises Unsupported before the first trial if the renderer rejects the setting at the mild end."""
@@ -163,6 +169,11 @@ class _Trials:
         if severe * milds > mild * severes:
             notes.append("success does not fall with severity: more trials succeed at the severe end than at the mild")
         return notes
+
+    def failures_in_words(self, level: float | None = None) -> str:
+        """The failed trials of a level, or of all levels, such as "3 of 4 trials failed"."""
+        outcomes = [trial.outcome.success for trial in self.all if level in (None, trial.level)]
+        return f"{outcomes.count(False)} of {plural(len(outcomes), 'trial')} failed"
 
     def successes_at(self, level: float) -> tuple[int, int]:
         outcomes = [trial.outcome.success for trial in self.all if trial.level == level]

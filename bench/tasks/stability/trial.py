@@ -38,6 +38,14 @@ class Criteria:
         for name in ("false_hits", "scale", "surface_error"):
             check_positive(f"task.criteria.{name}", getattr(self, name), "0.01 is strict")
 
+    @property
+    def of_renderings(self) -> str:
+        """The criterion of a rendering in words, in two lines."""
+        return (
+            f"success: at least {self.hits:g} of the true hits lie within the footprint of a pixel,\n"
+            f"and spurious hits are at most {self.false_hits:g} of them (without true hits: of the rays)"
+        )
+
 
 @dataclass(frozen=True)
 class FitSettings:
@@ -112,8 +120,9 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial of a search: its level from 0 to 1, its severity, and its outcome."""
+    """One trial of a search: its level from 0 to 1, its severity, its number at this level, and its outcome."""
 
     level: float
     severity: float
+    repeat: int
     outcome: Outcome
