@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
+import yaml
 from PIL import Image
 
 from datasets.files.shapenet import SYNSETS, ShapeNet
@@ -68,6 +69,27 @@ def commands() -> list[Command]:
             if text.startswith("python -m "):
                 by_text.setdefault(text, Command(file, tuple(shlex.split(text))))
     return list(by_text.values())
+
+
+def stress_tables() -> list[str]:
+    """The tables of stresses for conf/README.md, from the rows and comments of conf/stresses.yaml: one per group."""
+    blocks = (ROOT / "conf" / "stresses.yaml").read_text(encoding="utf-8").strip().split("\n\n")[1:]
+    stresses, made = yaml.safe_load("\n".join(blocks)), list[str]()
+    for block in blocks:
+        heading, *lines = block.splitlines()
+        rows, comments = list[str](), list[str]()
+        for line in lines:
+            if line.startswith("# "):
+                comments.append(line.removeprefix("# "))
+                continue
+            name = line.partition(":")[0]
+            sweep, meaning = stresses[name]["sweep"], " ".join(comments).rstrip(".")
+            mild, severe = (f"{sweep[end]:g}".replace("e-0", "e-") for end in ("mild", "severe"))
+            rows.append(f"| `{name}` | {meaning} | {mild} to {severe} {sweep['unit']} |")
+            comments = []
+        head = f"{heading.removeprefix('# ')}\n\n| `stress=` | meaning | mildest to severest |\n|---|---|---|\n"
+        made.append(head + "\n".join(rows))
+    return made
 
 
 def code_of(file: str, language: str) -> list[str]:

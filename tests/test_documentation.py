@@ -239,6 +239,15 @@ def test_the_page_of_choices_names_every_file(group):
     assert {name for name in names if not SETTINGS_OF_SPEED.match(name)} <= mentioned
 
 
+def test_the_tables_of_stresses_are_those_of_the_file():
+    stress_tables, text = documentation.stress_tables(), text_of("conf/README.md")
+    for table in stress_tables:
+        assert table in text, f"conf/README.md must have this table:\n{table}"
+        assert "|  |" not in table, "conf/stresses.yaml: write a comment, the meaning, before each row"
+    names = [name for name in tables.names("stress") if name != "none"]
+    assert sorted(re.findall(r"^\| `(\w+)`", "\n".join(stress_tables), re.MULTILINE)) == names
+
+
 def test_the_table_of_the_papers_has_the_numbers_of_shapes_that_are_shipped():
     row = re.compile(r"^\| \[[^|]*?results/paper/(\w+)\.md\)[^|]*\|[^|]*\|[^|]*\| (\d+) \|", re.MULTILINE)
     rows = row.findall(text_of("conf/README.md"))

@@ -188,11 +188,12 @@ def compose_choices(overrides: Sequence[str]) -> DictConfig:
 def unknown_choice(group: str, name: str, options: Sequence[str]) -> ValueError:
     """The error for an unknown choice, with similar choices."""
     text = f"unknown {group} {name!r}" if group else f"unknown configuration {name!r}"
-    mesh_hint = f"; a mesh of your own is dataset=mesh dataset.path={name}" if group == "dataset" else ""
-    class_hint = f"; {custom_renderer_hint('mypkg.Mine')}" if group == "renderer" else ""
-    class_hint = "; a file of your own needs --config-dir FOLDER" if group == "experiment" else class_hint
+    remedies = {"renderer": custom_renderer_hint("mypkg.Mine"), "stress": "conf/README.md has the meaning of each"}
+    remedies["experiment"] = "a file of your own needs --config-dir FOLDER"
+    if "/" in name or "." in name:
+        remedies = {"dataset": f"a mesh of your own is dataset=mesh dataset.path={name}"}
     hint = nearest(name, [option for option in options if not option.startswith("_")])  # choices with _ are only bases
-    return ValueError(text + hint + (mesh_hint if "/" in name or "." in name else class_hint))
+    return ValueError(f"{text}{hint}{f'; {remedies[group]}' if group in remedies else ''}")
 
 
 def unknown_key(key: str, config: DictConfig) -> ValueError:

@@ -50,6 +50,7 @@ def assert_one_line(err: str, *words: str) -> None:
 
 
 @each("arguments, words", [
+    ("stress=?", ("unknown stress '?'", "thin_plate", "conf/README.md")),
     ("task=compleetion", ("unknown task 'compleetion'", "did you mean completion")),
     ("renderer=zzz", ("unknown renderer 'zzz'", "custom, dist, dvr, edge_sampling, idr, mesh_proxy", "and variants")),
     ("experiment=table1", ("experiment is not chosen by default", "write +experiment=NAME")),
@@ -136,7 +137,12 @@ def test_an_experiment_without_its_first_line_is_an_error_that_names_the_line(be
 def test_a_word_lists_the_choices(bench, word):
     code, out, err = bench(word)
     assert (code, err) == (0, "")
-    for name in ("completion", "newton", "sofa", *(["table1", "dist_mask"] if word == "list" else ["-m +experiment="])):
+    for name in (
+        "completion",
+        "newton",
+        "sofa",
+        *(["table1", "dist_mask", "conf/README.md"] if word == "list" else ["-m +experiment="]),
+    ):
         assert name in out
 
 

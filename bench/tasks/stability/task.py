@@ -60,7 +60,9 @@ class Stability:
 
     def __post_init__(self) -> None:
         if self.stress is None:
-            raise ValueError("task=stability needs a stress: set stress=thin_plate, or another of conf/stresses.yaml")
+            raise ValueError(
+                "task=stability needs a stress: set stress=thin_plate, or another: conf/README.md lists all"
+            )
         check_at_least("task.resolution", self.resolution, 8, "64 resolves thin parts")
 
     def check(self, inputs: RunInputs) -> None:
