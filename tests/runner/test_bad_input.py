@@ -50,7 +50,7 @@ def assert_one_line(err: str, *words: str) -> None:
 
 
 @each("arguments, words", [
-    ("stress=?", ("unknown stress '?'", "thin_plate", "conf/README.md")),
+    ("stress=thin_plat", ("unknown stress 'thin_plat'", "did you mean thin_plate", "conf/README.md")),
     ("task=compleetion", ("unknown task 'compleetion'", "did you mean completion")),
     ("renderer=zzz", ("unknown renderer 'zzz'", "custom, dist, dvr, edge_sampling, idr, mesh_proxy", "and variants")),
     ("experiment=table1", ("experiment is not chosen by default", "write +experiment=NAME")),
