@@ -14,8 +14,9 @@ A ray is rendered alone, so the errors of coarse-to-fine marching do not show.
 Each renderer's derivatives of the hit distance are compared with central differences of the float64 reference. Their
 parameters are the three most sensitive ones of the latent code or the family's formula, and the object's translation
 for meshes and stresses.
-into=FILE names the picture, by default results/local/ray.png; a PDF is written too. The configuration in a run folder
-is trusted, as by `python -m bench`. A run of task=stability takes level= too.
+The picture is RESULTS/ray.png, with a PDF. RESULTS is results_dir (by default results/local), or the folder of the
+runs of RUN_FOLDER; into=FILE names another file. The configuration in a run folder is trusted, as by
+`python -m bench`. A run of task=stability takes level= too.
 
 pixels=worst writes RUN_FOLDER/rays: a PNG for each of the 12 most wrong pixels, which lie apart, with sentences in
 rays.json. `python -m bench.report results_dir=RESULTS` then shows them on the run's page.
@@ -81,7 +82,7 @@ class Options:
     pixels: str = ""
     zoom: float | None = None
     level: float | None = None
-    into: Path = Path(RESULTS) / "ray.png"
+    into: Path | None = None
 
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[Options, list[str]]:
@@ -211,7 +212,8 @@ def show(cells: list[PlannedRun], options: Options) -> None:
         (pixel, _), search = result.worst(1)[0], f", where {cells[0].renderer} is off most: {result.summary}"
     picture = picture_of(scene, pixel, search, renderers, options.zoom)
     print(*picture.texts, sep="\n")
-    _save(picture, options.into)
+    results_dir = options.run.resolve().parents[1] if options.run else Path(cells[0].config["results_dir"])
+    _save(picture, options.into or results_dir / "ray.png")
 
 
 def save_worst(scene: RayScene, renderer: RendererOfCell, search: Search, folder: Path) -> None:

@@ -183,6 +183,13 @@ def test_the_command_writes_a_picture_of_the_pixel_where_the_first_renderer_is_m
     assert path == tmp_path / "new" / "a.png" and path.stat().st_size > 10_000 and path.with_suffix(".pdf").is_file()
 
 
+def test_the_picture_is_in_the_results_folder_unless_into_names_another_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = command(*SMALL, "dataset=torus", "pixel=6,5", "renderer=newton", "results_dir=mine", main=main)
+    assert (code, err) == (0, "") and out.splitlines()[-1] == "mine/ray.png"
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
 def test_a_hit_before_a_near_surface_is_wrong_though_its_error_is_small(tmp_path):
     scene = ("task=stability", "stress=near_camera", "task.resolution=16", "level=1", "threads=1")
     code, out, _ = command(*scene, "renderer=dist", f"into={tmp_path / 'a'}", main=main)

@@ -38,7 +38,6 @@ HELP = """
 
 Any setting is KEY=VALUE: seed=1, threads=2, time_limit=600, results_dir=PATH, task.points=50, renderer.steps=30.
 --cfg job shows all settings and runs nothing; --config-dir PATH adds a folder of YAML."""
-MEANINGS = "Their meanings: conf/README.md"
 EXIT_FAILURE, EXIT_USAGE = 1, 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 KERNELS_VARIABLE = "IMPLICIT_BENCH_KERNELS"  # defined in renderers/kernels/library.py, which imports torch
@@ -122,7 +121,7 @@ def _help_text(arguments: list[str], about: str) -> str | None:
         return None
     groups = ("task", "renderer", "dataset", "scale") if is_help else LISTED_GROUPS
     listed = "\n".join(f"{group}: {', '.join(_choice_names(group))}" for group in groups)
-    return f"{about.strip()}\n{HELP}\n\n{listed}" if is_help else f"{listed}\n{MEANINGS}"
+    return f"{about.strip()}\n{HELP}\n\n{listed}" if is_help else f"{listed}\nconf/README.md has their meanings"
 
 
 def options_of(arguments: list[str]) -> Namespace:
