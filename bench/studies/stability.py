@@ -4,6 +4,7 @@ An axis is a kind of stress. Its level is 0 at the mildest severity of its sweep
 """
 
 import math
+import re
 import shlex
 from collections.abc import Callable
 from typing import Any
@@ -32,6 +33,7 @@ from bench.report.study import (
 PLACE = 120
 READS = (breakdowns.SELECTION,)
 DEFAULT_SCALE = "desk"
+LEVEL_TEXT = re.compile(r"[01]\.\d{6}")  # as draw_breakdown writes it
 FAILED = "failed_"  # prefix of the metrics that count failed trials by kind
 SURVIVED = LinearSegmentedColormap.from_list("survived", ["#fbf4e6", "#c9d7e2", "#7ba0bd", "#2f6690", "#0b2f4f"])
 AT_ONCE_COLOUR, MARK_COLOUR = "#b3261e", "#8a8a8a"
@@ -56,7 +58,8 @@ NOTES = (
     "renderer. Settings of renderers are left out.",
     "Intervals are those of the shown axis. They do not cover the choice of the axis. The mean rank is over the "
     "{ranked_axes} axes that judge renderings, with its bootstrap interval over axes.",
-    "Each renderer has one preset. The page “stability_axes” has all presets and all numbers.",
+    "Each renderer has one preset. python -m bench.report also writes the page “stability_axes”, with all presets and "
+    "all numbers.",
 )
 
 
@@ -140,12 +143,19 @@ def _rays(runs: Runs, cells: pd.DataFrame) -> list[dict[str, Any] | None]:
 
 
 def first_trials(runs: Runs, record: records.Record) -> dict[float, bool]:
-    """Levels of which the outcome of the first trial is certain, which is the trial that bench.ray shows."""
+    """Levels of which the outcome of the first trial is certain, which is the trial that bench.ray shows.
+
+    They are those of the curve, or without it those of the pictures and the ends of the sweep.
+    """
     metrics, tried = record["metrics"], dict[float, bool]()
     for level, end in zip((0.0, 1.0), breakdowns.ENDS, strict=True):
         successes, trials = (metrics.get(f"{end}_{name}") for name in ("successes", "trials"))
         if trials and successes in (0, trials):
             tried[level] = successes == trials
+    pictures = record.get("pictures") or {}
+    for name, success in (("works", True), ("breaks", False)):
+        if LEVEL_TEXT.fullmatch(text := str(pictures.get(f"{name}_level"))):
+            tried[float(text)] = success
     try:
         lines = curve_lines(runs.folder(record)) or []
     except NoFolder:

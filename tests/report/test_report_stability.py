@@ -138,6 +138,8 @@ def test_a_shipped_row_has_the_ends_of_the_sweep_at_which_all_trials_agree():
     runs = Runs(READS[0], Path("results"), [record])
     assert first_trials(runs, record) == {0.0: True}
     assert first_trials(runs, record | {"metrics": numbers | {"severe_successes": 0}}) == {0.0: True, 1.0: False}
+    pictures = {"works": "", "works_text": "", "works_level": "0.531250", "breaks_level": "0.562500"}
+    assert first_trials(runs, record | {"pictures": pictures}) == {0.0: True, 0.53125: True, 0.5625: False}
 
 
 def test_one_trial_per_level_has_no_interval_anywhere(tmp_path):
