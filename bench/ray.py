@@ -41,7 +41,7 @@ from bench.evaluate.reference import in_float64
 from bench.pictures.ray import LanePanel, RayPicture, draw_map
 from bench.records.format import number, plural
 from bench.records.record import bad_link, read_record, to_json, write_text
-from bench.records.results import RESULTS, PlannedRun
+from bench.records.results import PlannedRun
 from bench.report.site.rays import MAP_FILE, MAX_RAYS, RAYS_FILE, RAYS_FOLDER, ray_file
 from bench.runner.command import command_line
 from bench.runner.compose import Composer
