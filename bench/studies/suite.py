@@ -56,8 +56,8 @@ PROGRESS = (
     "silhouette loss, which were chosen in runs of fixed length: 100 iterations in complete, 200 in reconstruct. Pose "
     "and multiview have the defaults of their tasks, multiview without a silhouette loss.",
     f"Significant: by a sign-flip test over scenes, with Holm's correction over all pairs of a budget at {ALPHA:.0%}. "
-    "At that level, 5 % of simulated draws of equal renderers may have a false pair. If more have one, no pair counts "
-    "as significant. The sample is of these four families.",
+    "If more than 5 % of simulated draws of equal renderers have a false pair at that level, no pair counts as "
+    "significant. All scenes are of four families of shapes, so the test covers no others.",
 )
 
 TUNED = "Tuned: each renderer with its own learning rate and rays, chosen on validation shapes."
@@ -221,17 +221,20 @@ def draw(panels: Sequence[chart.Panel], ranks: Mapping[str, Mapping[str, str]]) 
     """
     figure = Figure(figsize=(figure_style.WIDTH, 5.6), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(1.55, 1))
-    widths = 5.6, *[1.0] * len(ranks)
-    lead, *others = above.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
+    widths = 5.2, 0.4, *[1.0] * len(ranks)
+    lead, key, *others = above.subplots(1, len(widths), width_ratios=widths, squeeze=False)[0]
     _fractions(lead, panels[0])
     lead.set_title(panels[0]["title"], loc="left")
+    lead.set_ylabel(panels[0]["y"]["title"])
     lines = [*{line["name"]: line for line in panels[0]["series"]}.values()]
+    _names(key, lines)
     for axis, (title, rows) in zip(others, ranks.items(), strict=True):
-        _ranks(axis, title, rows, lines, named=axis is others[0])
+        _ranks(axis, title, rows, lines)
     small = below.subplots(1, max(len(panels) - 1, 1), sharey=True, squeeze=False)[0]
     for axis, panel in zip(small, panels[1:], strict=False):
         _fractions(axis, panel)
         axis.set_title(panel["title"], loc="left")
+    small[0].set_ylabel(panels[0]["y"]["title"])
     below.supxlabel(panels[0]["x"]["title"], fontsize=lead.yaxis.label.get_size())
     return figure
 
@@ -249,7 +252,25 @@ def _fractions(axis: Axes, panel: chart.Panel) -> None:
     axis.set_yticks([0, 0.25, 0.5, 0.75, 1], ["initial, 0 %", "25 %", "50 %", "75 %", "best, 100 %"])
 
 
-def _ranks(axis: Axes, title: str, rows: Mapping[str, str], lines: Sequence[chart.Series], *, named: bool) -> None:
+def _names(axis: Axes, lines: Sequence[chart.Series]) -> None:
+    """Draws a piece of each line, with its name."""
+    for number, line in enumerate(lines):
+        axis.plot([0, 1], [number, number], color=line["colour"], ls=line["dash"])
+    _rows(axis, [line["name"].partition(",")[0] for line in lines])
+    for label, line in zip(axis.get_yticklabels(), lines, strict=True):
+        label.set_color(line["colour"])
+    axis.spines[:].set_visible(False)
+    axis.set_xticks([])
+
+
+def _rows(axis: Axes, names: Sequence[str]) -> None:
+    axis.set_ylim(len(names) - 0.4, -0.6)
+    axis.set_yticks(range(len(names)), names)
+    axis.tick_params(axis="y", length=0)
+    axis.grid(False, axis="y")
+
+
+def _ranks(axis: Axes, title: str, rows: Mapping[str, str], lines: Sequence[chart.Series]) -> None:
     for number, line in enumerate(lines):
         if line["name"] not in rows:
             axis.text(0.7, number, "–", color=line["colour"], va="center_baseline")
@@ -258,13 +279,9 @@ def _ranks(axis: Axes, title: str, rows: Mapping[str, str], lines: Sequence[char
         low, high = ends[0], ends[-1]
         axis.barh(number, high - low + 0.7, left=low - 0.35, height=0.55, color=line["colour"])
     count = len(lines)
-    axis.set(xlim=(0.3, count + 0.7), ylim=(count - 0.4, -0.6), xticks=[1, count], xlabel="rank")
+    axis.set(xlim=(0.3, count + 0.7), xticks=[1, count], xlabel="rank")
     axis.set_title(title, loc="left")
-    axis.set_yticks(range(count), [line["name"].partition(",")[0] if named else "" for line in lines])
-    for label, line in zip(axis.get_yticklabels(), lines, strict=True):
-        label.set_color(line["colour"])
-    axis.tick_params(axis="y", length=0)
-    axis.grid(False, axis="y")
+    _rows(axis, [""] * count)
 
 
 def verdict(made: Standing) -> str:
@@ -296,15 +313,18 @@ def failures(made: Standing) -> str:
         + " and ".join(f"{units(key[1])} ({line.failed} of {line.runs})" for key, line in at_budgets.iterrows())
         for (row, name), at_budgets in most.groupby(level=["row", "set"], sort=False)
     ]
-    return f"{'; '.join(names)}; {failed or 'none'} of {runs} others failed."
+    return f"{'; '.join(names)}; {failed or 'none'} of {runs} other runs failed."
 
 
 def _first_of_sets(made: Standing) -> str:
     means, firsts = made.complete.groupby(["budget", "set", "row"])["progress"].mean(), dict[float, list[str]]()
     for (budget, name), rows in means.groupby(["budget", "set"], sort=False):
         best = rows.droplevel(["budget", "set"])
-        firsts.setdefault(budget, []).append(f"{name}, {best.idxmax()} (*{percent(best.max())}*)")
-    return " ".join(f"At {units(budget)}, the most progress: {'; '.join(sets)}." for budget, sets in firsts.items())
+        firsts.setdefault(budget, []).append(f"{name} *{percent(best.max())}* ({best.idxmax()})")
+    most = (f"Most progress at {units(budget)}: {'; '.join(sets)}." for budget, sets in firsts.items())
+    seconds = standing.seconds_per_unit(made.everything)["seconds"].dropna()
+    ends = f"{format.seconds(seconds.min())} to {format.seconds(seconds.max())}" if len(seconds) else ""
+    return " ".join([*most, *([f"A unit takes {ends} (median per set and renderer)."] if ends else [])])
 
 
 def _notes(made: Standing) -> list[str]:
@@ -312,8 +332,11 @@ def _notes(made: Standing) -> list[str]:
     notes, runs = [], made.complete
     for budget, ranked in made.rankings.items():
         at_budget = runs[runs["budget"] == budget]
-        least = f"The smallest p is {ranked.least_p:.2g}; the first pair needs {ALPHA / max(ranked.pairs, 1):.2g}"
-        possible = f"the tested sign flips of {format.plural(ranked.scenes, 'scene')} allow {ranked.possible_p:.2g}"
+        required = f"Holm's correction first requires {ALPHA / max(ranked.pairs, 1):.2g}"
+        least = f"The smallest p value is {ranked.least_p:.2g}. {required}"
+        possible = (
+            f"sign flips of {format.plural(ranked.scenes, 'scene')} cannot give less than {ranked.possible_p:.2g}"
+        )
         pairs = f"{len(ranked.better)} of {ranked.pairs} pairs differ significantly"
         if ranked.level > MAX_LEVEL:
             pairs = f"no pair counts as significant, since {percent(ranked.level)} of simulated draws have a false pair"
@@ -325,8 +348,8 @@ def _notes(made: Standing) -> list[str]:
         counts = further.groupby("set").size() / at_budget[at_budget["ok"]].groupby("set").size()
         for name, fraction in counts[counts > MENTIONED_FRACTION_OF_LARGER_ERRORS].items():
             notes.append(
-                f"At {units(budget)}, {percent(fraction)} of the runs of {name} that ended ok have a larger error than "
-                "at their start: their loss fell. Their progress is 0 %."
+                f"At {units(budget)}, {percent(fraction)} of the runs of {name} that ended ok have a larger error at "
+                "their end than at their start, although their loss fell. Their progress is 0 %."
             )
         for name in made.sets:
             ends = standing.bounds(at_budget[at_budget["set"] == name])
@@ -341,7 +364,7 @@ def _notes(made: Standing) -> list[str]:
         for name in sets if len(sets := _sets_at(made, budget)) > 1 else ():
             others = standing.ranking(at_budget[at_budget["set"] != name])
             if ranked.decidable and others.decidable:
-                lead = leaders(others, f"Without {name}, at {units(budget)}")
+                lead = leaders(others, f"Without the set {name}, at {units(budget)}")
                 order = f"The order is: {'; '.join(others.progress)}. Different pairs: {len(others.better)}."
                 notes.append(f"{lead} {order}")
     for (budget, row), sets in made.cannot_run.items():
@@ -357,7 +380,7 @@ def _notes(made: Standing) -> list[str]:
         notes.append(f"Not compared, because runs are missing: {rows}.")
     machines, loaded = runs.loc[runs["cpu"] != "", "machine"].nunique(), (~runs["timed"]).sum()
     versions, kinds = format.plural(runs["commit"].nunique(), "commit"), format.plural(machines, "machine")
-    notes.append(f"Runs: {versions}, {kinds} (counted apart by threads and kernels).")
+    notes.append(f"The runs are of {versions} and {kinds}; other threads or kernels count as another machine.")
     notes.append(f"{loaded} of {len(runs)} runs have no runtime, because the machine had other load.")
     return [note.replace("*", "") for note in notes]  # without the marks of numbers in verdicts
 

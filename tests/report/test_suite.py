@@ -45,6 +45,7 @@ from bench.report.suite.standing import (
 )
 from bench.report.suite.tuned import CANDIDATES, setting_overrides, stated_rate
 from bench.report.suite.verdicts import leaders
+from bench.report.write import chart
 from bench.studies import suite as study
 from bench.studies import suite_tuned
 from bench.suite import _expected_runtime, _sweeps, main, parse_arguments, print_standing
@@ -586,7 +587,7 @@ def test_the_answer_says_what_differs_at_each_budget_what_failed_and_what_scenes
     lost = [attempt("Lost", scene, {0: 1.0, 50: 1.0}, status="diverged", final=inf) for scene in TEN]
     answer = study.verdict(page([*made(rows, TEN), *lost], tmp_path / "three", monkeypatch))
     assert answer.startswith("At 1 unit, B (*100 %*) makes significantly more progress than 2 others. 3 of 3 pairs")
-    assert "Lost failed in complete at 1 unit (10 of 10); none of 20 others failed." in answer
+    assert "Lost failed in complete at 1 unit (10 of 10); none of 20 other runs failed." in answer
     few = [one for one in made(rows, TEN) if one.scene in TEN[:3]]
     said = study.verdict(page(few, tmp_path / "few", monkeypatch))
     assert said.startswith("At 1 unit, 3 scenes cannot decide ") and said.endswith("None of 6 runs failed.")
@@ -712,3 +713,12 @@ def test_a_second_start_shows_the_spread_and_changes_no_comparison(tmp_path):
     assert "100 % of them differs by more than 5 points, and the median difference is 15.1" in study._second_starts(
         made, 1.0
     )
+
+
+def test_a_figure_names_its_axes_and_shows_the_style_of_each_line():
+    lines = [chart.curve(name, "", [1, 2], [0.1, 0.2], dash=dash) for name, dash in (("A, 1", ":"), ("B", "--"))]
+    figure = study.draw([chart.panel_data(title, "cost", "progress", lines) for title in "ab"], {"1 unit": {"B": "1"}})
+    progress, names, *_ = figure.axes
+    assert [axis.get_ylabel() for axis in (progress, figure.axes[-1])] == ["progress", "progress"]
+    assert [text.get_text() for text in names.get_yticklabels()] == ["A", "B"]
+    assert [line.get_linestyle() for line in names.lines] == [":", "--"]

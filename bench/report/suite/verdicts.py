@@ -25,7 +25,8 @@ def leaders(ranked: Ranking, when: str) -> str:
     tied = [row for row in ranked.progress if row not in (first[0], *behind)]
     less = f"{plural(len(behind), 'other')}: {', '.join(names[row] for row in behind)}"
     if len(behind) > len(tied) > 0:
-        others = ", ".join(names[row] for row in tied) if len(tied) <= MAX_NAMED else str(len(tied))
+        others = " and ".join(filter(None, [", ".join(names[row] for row in tied[:-1]), names[tied[-1]]]))
+        others = others if len(tied) <= MAX_NAMED else str(len(tied))
         return f"{when}, {rows[0]} makes significantly more progress than all but {others}."
     than = f"significantly more than {less}" if behind else "and cannot be distinguished from any other"
     return f"{when}, {rows[0]} makes the most progress, {than}."
