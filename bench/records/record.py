@@ -160,11 +160,11 @@ class Record:
 def row_name(config: dict[str, Any], renderer: str) -> str:
     """The name of a run's row: `renderer_name`, and the silhouette loss unless it is the default of the renderer.
 
-    If task.masks is false, the run used no silhouette loss, and the name has "without masks".
+    If task.masks is false, the run used no silhouette loss, and the name has "without masks" unless it has "no masks".
     """
     name, loss = renderer_name(config, renderer), _label_of(config.get("silhouette"))
     if (config.get("task") or {}).get("masks") is False:
-        loss = "without masks"
+        loss = "" if name.endswith("no masks") else "without masks"
     return f"{name}, {loss}" if loss else name
 
 

@@ -61,6 +61,8 @@ def test_records_and_plans_without_a_method_are_read(tmp_path):
 def test_a_record_is_named_by_its_silhouette_loss_unless_it_has_no_masks():
     config = {"label": "Newton, RGB", "silhouette": {"_label_": "IDR's mask loss"}, "task": {"masks": False}}
     assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, without masks"
+    unmasked = config | {"label": "NeuS, no masks"}
+    assert Record("a", "reconstruction", "neus", "car", 0, unmasked).name == "NeuS, no masks"
     config["task"]["masks"] = True
     assert Record("a", "reconstruction", "newton", "car", 0, config).name == "Newton, RGB, IDR's mask loss"
 
