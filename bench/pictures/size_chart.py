@@ -17,7 +17,7 @@ KINDS = {  # from the beginning of a candidate's name to label, colour and marke
     "hash": ("hash grids", "#cc79a7", "^"),
     "grid": ("narrow-band grid", "#9a6a1f", "v"),
     "union": ("unions of boxes", "#009e73", "P"),
-    "": ("one part", "#d55e00", "o"),
+    "": ("single primitives", "#d55e00", "o"),
 }
 CONFIRMED_FROM = 0.8  # fraction of the draws of further views on which a chosen candidate must suffice
 FLOPS = "flops_per_query"

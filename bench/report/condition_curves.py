@@ -130,14 +130,14 @@ class ConditionCurves:
             return f"No ratio at {self.heading.lower()} {self.compared:g}: no row has it with a row to compare it with."
         verdicts = dict(zip(ratios, statistics.ratio_verdicts([*ratios.values()]), strict=True))
         differ = [name for name, verdict in verdicts.items() if verdict is statistics.Verdict.DIFFERS]
-        parts = [f"{name} *{format.number(ratios[name].value)}*" for name in differ]
+        parts = [f"*{format.number(ratios[name].value)}* ({name})" for name in differ]
         if len(differ) < len(ratios):
             undecided = statistics.Verdict.NOT_DECIDABLE in verdicts.values()
-            reason = "too few shapes" if undecided else "not significantly different from 1"
+            reason = "undecided: too few shapes" if undecided else "not significantly different from 1"
             if differ:
-                parts.append(f"{format.plural(len(ratios) - len(differ), 'other row')}: {reason}")
+                parts.append(f"{format.plural(len(ratios) - len(differ), 'other row')} {reason}")
             else:
-                parts = [f"{name} *{format.number(ratio.value)}*, {reason}" for name, ratio in ratios.items()]
+                parts = [f"*{format.number(ratio.value)}* ({name}), {reason}" for name, ratio in ratios.items()]
         shapes = sorted({len(ratio.points) for ratio in ratios.values()})
         return f"{self.verdict}: {'; '.join(parts)}; n = {' or '.join(map(str, shapes))} shapes."
 

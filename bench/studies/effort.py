@@ -18,8 +18,8 @@ FULL = {  # each row, and the row of the same renderer with full effort
 }
 NAMES = {"newton_mask": "Newton, effort=full", "idr_mask": "IDR, effort=full"}
 HEADLINES = {  # the beginning of a sentence of the verdict, and its rows
-    "Relative to full effort, effort=needed": ("dist_needed", "newton_needed", "idr_needed"),
-    "60 iterations": ("dist_60",),
+    "Relative to full effort, with effort=needed": ("dist_needed", "newton_needed", "idr_needed"),
+    "With 60 iterations": ("dist_60",),
 }
 NOTES = (
     compare.ERROR,

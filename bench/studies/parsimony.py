@@ -131,19 +131,23 @@ def _falling(lines: list[Line]) -> str:
 
 
 def _verdict(lines: list[Line]) -> str:
-    """Whether a single field is best by all quantities, and which kinds are; empty without runs that ended ok."""
+    """The sizes that suffice, and the kinds of the best fields by each quantity; empty without runs that ended ok."""
     if not lines:
         return ""
     fewest, quickest = ([line[choice] for line in lines] for choice in ("by_numbers", "by_flops"))
     best = [line["candidates"].best for line in lines]
     same = sum(a is not None and a is b is c for a, b, c in zip(fewest, quickest, best, strict=True))
-    sample = "scenes" if len({line["scene"] for line in lines}) == len(lines) else "scenes and resolutions"
+    are_scenes = len({line["scene"] for line in lines}) == len(lines)
+    sample = format.plural(len(lines), "scene") if are_scenes else f"{len(lines)} scenes and resolutions"
+    sizes = sorted(result.numbers["stored"] for result in fewest if result is not None)
+    sample = f"{len(sizes)} of {sample}" if 0 < len(sizes) < len(lines) else sample
+    enough = f"*{' to '.join(f'{size:,}' for size in dict.fromkeys((*sizes[:1], *sizes[-1:])))}* numbers suffice"
     unchecked = sum(result is not None and result.held(by_pixel=True) is None for result in quickest)
     limit = f" (not checked on further views: {unchecked})" if unchecked else ""
     return (
-        f"In *{same} of {len(lines)}* {sample}, a single field has the fewest numbers, the fewest FLOPs and the least "
-        f"error. Fewest numbers under half a pixel: {_kinds(fewest)}. Fewest FLOPs: {_kinds(quickest)}{limit}. Least "
-        f"error: {_kinds(best)}."
+        f"{f'{enough} for an error under half a pixel in' if sizes else 'No field suffices at half a pixel in'} "
+        f"{sample}. Fewest numbers: {_kinds(fewest)}. Fewest FLOPs: {_kinds(quickest)}{limit}. Least error: "
+        f"{_kinds(best)}. One field is best by all three in *{same}*."
     )
 
 

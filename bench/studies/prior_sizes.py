@@ -91,11 +91,12 @@ def _verdict(lines: list[Line]) -> str:
     candidates = [line for line in (*similar, largest) if line["flops"]]  # with a run that ended ok
     if not tested or statistics.Verdict.NOT_DECIDABLE in verdicts or largest not in candidates:
         return compare.differing(ratios, f"of errors, to {largest['row']},")
-    text = f"{compare.HOLM}, *{sum(is_larger)} of {len(tested)}* priors have a larger error than {largest['row']}."
+    text = f"{compare.HOLM}, *{sum(is_larger)} of {len(tested)}* priors have a larger error."
     smallest = min(candidates, key=lambda line: line["weights"])
     if smallest is largest:
-        return f"{text} No smaller prior suffices."
-    return f"{text} The smallest of the others is *{smallest['row']}*."
+        return f"No smaller prior is as good as *{largest['row']}* (layers × width). {text}"
+    limit = f"without a significantly larger error than {largest['row']}"
+    return f"The smallest prior {limit} is *{smallest['row']}* (layers × width). {text}"
 
 
 def _panels(pooled: list[Line]) -> list[chart.Panel]:

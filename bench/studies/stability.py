@@ -305,12 +305,13 @@ def _hardest_axis(cells: pd.DataFrame) -> str:
     if shares.empty or not shares.iloc[0] > 0:
         return ""
     hardest = [str(axis) for axis in shares.index[shares == shares.iloc[0]]]
-    broken = " and ".join(
-        f"{breakdowns.title(axis)} (*{counts.loc[axis, 'sum']} of {counts.loc[axis, 'size']}*)" for axis in hardest
+    names = " and ".join(breakdowns.title(axis) for axis in hardest)
+    verb = "break" if len(hardest) > 1 or names.endswith("s") else "breaks"
+    broken = " and ".join(f"*{counts.loc[axis, 'sum']} of {counts.loc[axis, 'size']}*" for axis in hardest)
+    where = f"At the mildest severity, {names} {verb} the largest share of renderers: {broken}"
+    return (
+        f"{where}. The table shows what breaks each renderer first, of {format.plural(len(shares), 'kind')} of stress."
     )
-    among = f", of {len(shares)} axes" if len(shares) > 1 else ""
-    where = f"At the mildest severity, the largest share of renderers breaks on {broken}{among}"
-    return f"{where}. The table has what breaks each one first."
 
 
 PAGES = {"stability": make}

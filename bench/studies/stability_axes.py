@@ -63,7 +63,7 @@ def make_axes(runs: Runs) -> Result:
         "The severity at which half of the trials succeed, on each axis (kind of stress).",
         question="At which severity of stress does each renderer break?",
         verdict=table.extremes(
-            "Axes on which a renderer does not break",
+            "Kinds of stress that do not break a renderer at any tested severity",
             cells.groupby("row", sort=False)["never"].sum().to_dict(),
             f"{trials:.0f} trials on {len(axes)} axes",
             show=table.integer,

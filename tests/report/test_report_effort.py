@@ -60,7 +60,7 @@ def test_outlines_are_compared_with_their_start(tmp_path):
             settings = {"view": {"resolution": 24, "rays_per_pixel": rays}}
             made(tmp_path, "outline", "outline_relaxed", shape, metrics, settings=settings)
     page = page_of(tmp_path, "outline")
-    assert "outline_relaxed *0.250*" in page.verdict and page.verdict.endswith("n = 8 shapes.")
+    assert "*0.250* (outline_relaxed)" in page.verdict and page.verdict.endswith("n = 8 shapes.")
     text = " ".join(page.notes)
     assert "an error of 15 pixels (median over shapes)" in text
     assert "Area error with 1 ray over that of the start, not tested: outline_relaxed, 1.41 [1.00, 2.00]." in text

@@ -64,7 +64,7 @@ def test_a_row_a_scene_the_least_need_first_and_a_failed_run_last(page):
     lost = page.data[page.data["scene"] == "torus 0"]
     assert (lost["status"].item(), lost["reason"].item()) == ("crashed", "why")
     assert "1 of 4 runs did not end ok: dist, 64 resolution, torus: crashed (why)." in told(page)
-    assert page.verdict.startswith("In *2 of 3* scenes, a single field has")
+    assert page.verdict.startswith("*4 to ") and " in 3 scenes. " in page.verdict and "all three in *2*" in page.verdict
 
 
 def test_a_row_has_a_choice_by_each_quantity(page):
@@ -120,7 +120,9 @@ def test_choices_have_rings_and_the_front_and_half_a_pixel_are_drawn(page):
     assert set(map(str, rings.values())) == {"([6000.0], [18.0])"} and len(rings) == 2
     lines = {each["name"]: each["y"] for each in panel["series"] if "dash" in each}
     assert lines == {"front of error and FLOPs": [160, 40, 18], "half a pixel": [20, 20]}
-    small, large = (each["size"] for each in panel["series"] if each["name"] in ("one part", "narrow-band grid"))
+    small, large = (
+        each["size"] for each in panel["series"] if each["name"] in ("single primitives", "narrow-band grid")
+    )
     assert small < large and len(page.figure.axes) == 4
 
 

@@ -29,18 +29,18 @@ def line(row: str, errors: list[float], weights: int) -> dict:
     }
 
 
-@each("small, middle, words", [
-    (WORSE, ALIKE, "*1 of 2* priors have a larger error than large. The smallest of the others is *middle*."),
-    (ALIKE, ALIKE, "*0 of 2* priors have a larger error than large. The smallest of the others is *small*."),
-    (BETTER, ALIKE, "*0 of 2* priors have a larger error than large. The smallest of the others is *small*."),
-    (WORSE, WORSE, "*2 of 2* priors have a larger error than large. No smaller prior suffices."),
+@each("small, middle, answer, count", [
+    (WORSE, ALIKE, "larger error than large is *middle*", "*1 of 2* priors have a larger error."),
+    (ALIKE, ALIKE, "larger error than large is *small*", "*0 of 2* priors have a larger error."),
+    (BETTER, ALIKE, "larger error than large is *small*", "*0 of 2* priors have a larger error."),
+    (WORSE, WORSE, "No smaller prior is as good as *large*", "*2 of 2* priors have a larger error."),
 ])  # fmt: skip
-def test_the_verdict_names_the_smallest_prior_without_a_larger_error(small, middle, words):
+def test_the_verdict_names_the_smallest_prior_without_a_larger_error(small, middle, answer, count):
     largest = {"row": "large", "flops": 1.0, "weights": 100, "ratio": None}
     text = _verdict([line("small", small, 10), line("middle", middle, 50), largest])
     too_few_shapes = [line(name, [1.1] * 6, 10) for name in "abc"]
     assert "smallest" not in _verdict([*too_few_shapes, largest])
-    assert text.endswith(words)
+    assert answer in text and text.endswith(count)
 
 
 def test_priors_are_compared_within_a_renderer_and_a_failed_prior_has_no_ratio(tmp_path):

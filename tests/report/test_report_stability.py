@@ -56,7 +56,7 @@ def test_a_breakdown_stands_with_its_interval(tmp_path):
     broke(tmp_path, "wires", "DVR", 1.1)
     page = page_of(tmp_path, "stability_axes")
     assert page.table.iloc[0].tolist()[:3] == ["thin wires", "scene units", "0.100 (0.126 to 0.0794)"]
-    assert page.verdict.endswith("does not break: *1* (DVR) to 0 (DIST); n = 20 trials on 1 axes.")
+    assert page.verdict.endswith(": *1* (DVR) to 0 (DIST); n = 20 trials on 1 axes.")
     assert "n = 20 trials in all, of 1 axes and 2 renderers" in told(page) and "25 % of the trials" in told(page)
     first = page_of(tmp_path, "stability")
     assert first.data["full"].iloc[0] == "0.100 scene units (0.126 to 0.0794)"
@@ -76,7 +76,7 @@ def test_a_renderer_has_the_axes_on_which_it_breaks_first_and_the_one_on_which_i
     assert rows.loc["DIST"].tolist()[:3] == [at_once, "fine bumps, 20 % [15, 25]", never]
     firsts = ["thin plate, 30 % [25, 35]", "fine bumps, 40 % [35, 45]"]
     assert rows.loc["DVR"].tolist()[:3] == [*firsts, "narrow gap, 50 % [45, 55]"]
-    assert "At the mildest severity, the largest share of renderers breaks on narrow gap (*1 of 2*)" in page.verdict
+    assert "At the mildest severity, narrow gap breaks the largest share of renderers: *1 of 2*." in page.verdict
     labels = [label.get_text() for label in page.figure.axes[0].get_xticklabels()]
     assert labels == ["large alpha", "narrow gap", "fine bumps", "thin plate", "thin wires"]
 
@@ -90,7 +90,7 @@ def test_the_hardest_axis_breaks_the_largest_share_and_equal_breakdowns_inside_s
     for renderer, level in (("DIST", -0.1), ("DVR", -0.1), ("IDR", 0.5)):
         broke(tmp_path, "narrow_view", renderer, level)
     page = page_of(tmp_path, "stability")
-    assert "the largest share of renderers breaks on grazing plane (*1 of 1*), of 8 axes." in page.verdict
+    assert "grazing plane breaks the largest share of renderers: *1 of 1*." in page.verdict
     assert "Equal breakdowns in all renderings: DIST; DVR." in page.notes
 
 
