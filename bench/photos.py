@@ -9,8 +9,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.style import SCREEN, bare, silhouette_image
-from bench.records.results import RESULTS
-from bench.tables import CONF, read_yaml
+from bench.tables import choice
 from datasets.files.captures.frames import AXES
 from datasets.files.captures.hull import MaskFit
 from datasets.files.captures.sphere import likely_cause
@@ -74,7 +73,11 @@ def draw(capture: Capture) -> Figure:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.photos", description=__doc__)
     parser.add_argument("folder", type=Path, help="with photographs and their cameras, see datasets/README.md")
-    parser.add_argument("--longest", type=int, default=128, help="pixels of the longer side (default: %(default)s)")
+    longest, held_out = choice("scale", "desk")["reconstruction"]["longest"], choice("task", "_photographs")["held_out"]
+    run = "as task.{} of a run (default: %(default)s)".format
+    parser.add_argument("--longest", type=int, default=longest, help=f"pixels of the longer side, {run('longest')}")
+    text = f"N: the sphere ignores each N-th photograph, {run('held_out')}"
+    parser.add_argument("--held-out", type=int, default=held_out, help=text)
     parser.add_argument("--axes", choices=tuple(AXES), default="stated", help="flipped: y and z turned round")
     parser.add_argument("--images", help="the folder of COLMAP's images, where it is not the usual one")
     parser.add_argument("--without-masks", action="store_true", help="as if there were none")
@@ -85,14 +88,14 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         into.parent.mkdir(parents=True, exist_ok=True)
         masks = not options.without_masks
-        held_out = read_yaml(CONF / "task" / "_photographs.yaml")["held_out"]  # the sphere is that of a run
-        reading = ReadSettings(options.longest, masks, options.axes, held_out, options.images, unchecked=True)
+        reading = ReadSettings(options.longest, masks, options.axes, options.held_out, options.images, unchecked=True)
         capture = read_capture(options.folder, reading)
         draw(capture).savefig(into, dpi=110)
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     print(capture.summary)
+    print(f"a run has this sphere with task.longest={options.longest} task.held_out={options.held_out}")
     for note in capture.notes:
         if PHOTOS_HINT not in note:  # the fit is printed below
             print(f"note: {note}")

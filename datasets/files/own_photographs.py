@@ -12,7 +12,7 @@ from jaxtyping import Float
 from datasets.files.captures.frames import AXES, Frame, Layout, nearest_rigid_matrix, rigid_matrix
 from datasets.files.captures.hull import MaskFit, measure_mask_fit
 from datasets.files.captures.layouts import find_layout
-from datasets.files.captures.mistakes import intrinsics_fault, likely_mistake
+from datasets.files.captures.mistakes import focal_doubt, intrinsics_fault, likely_mistake
 from datasets.files.captures.sphere import Sphere, UnfitCameras, hull_sphere, in_world, likely_cause, viewed_sphere
 from datasets.files.captures.take import exif_notes, read_shots
 from datasets.mesh import Mesh
@@ -157,7 +157,9 @@ class ReadSettings:
     unchecked: bool = False
 
     def __post_init__(self) -> None:
-        check_at_least("longest", self.longest, 8, "128 shows what there is")
+        check_at_least("longest", self.longest, 8, "96 shows what there is")
+        if self.held_out is not None:
+            check_at_least("held_out", self.held_out, 2, "8 holds out an eighth")
 
 
 def read_capture(folder: Path, settings: ReadSettings) -> Capture:
@@ -277,9 +279,8 @@ def _check_fit(capture: Capture, layout: Layout, settings: ReadSettings) -> tupl
     }
     notes = [text for text, fraction in fractions_by_text.items() if REFUSE_BELOW <= fraction < WARN_BELOW]
     refused = [text for text, fraction in fractions_by_text.items() if fraction < REFUSE_BELOW]
-    if layout.doubt and overlap < GOOD_OVERLAP:
-        messages = refused or notes
-        messages.insert(0, layout.doubt)
+    doubts = [layout.doubt if overlap < GOOD_OVERLAP else "", focal_doubt(capture.shots)]
+    (refused or notes)[:0] = filter(None, doubts)
     return replace(capture, notes=(*capture.notes, *notes)), refused
 
 

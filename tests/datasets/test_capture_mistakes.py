@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from datasets.files.captures.frames import OPENGL, Frame
-from datasets.files.captures.mistakes import ROLLED, Views, hull_fit, likely_mistake
+from datasets.files.captures.mistakes import ROLLED, Views, focal_doubt, hull_fit, likely_mistake
 from datasets.files.own_photographs import ReadSettings, read_capture
 from datasets.shot import Shot
 from renderers.camera import Camera
@@ -107,13 +107,16 @@ READ = ReadSettings(SIZE[1])
 def mistake_in(views: Views) -> str:
     """The mistake in photographs whose names are not in the order of their numbers, as `pair_by_order` reads them."""
     frames = [Frame(Path(name), k, np.eye(4), size=SIZE) for name, k in zip(NAMES, views.intrinsics, strict=True)]
-    shots = [
+    return likely_mistake(shots_of(views), frames, "stated")
+
+
+def shots_of(views: Views) -> list[Shot]:
+    return [
         Shot(name, Camera(*map(torch.from_numpy, (k, motion)), *SIZE), torch.zeros(*SIZE, 3), torch.from_numpy(mask))
         for name, k, motion, mask in zip(
             sorted(NAMES), views.intrinsics, views.world_to_camera, map(np.ascontiguousarray, views.masks), strict=True
         )
     ]
-    return likely_mistake(shots, frames, "stated")
 
 
 def write_images(folder: Path, views: Views, names: list[str]) -> None:
@@ -162,13 +165,21 @@ def test_a_mistake_is_named_and_other_faults_have_no_name(mistake, seed):
     assert (words in text) if words else (text == "")
 
 
+@pytest.mark.parametrize("factor, correction", [(0.5, "2.0"), (1.0, None), (2.0, "0.5")])
+def test_a_wrong_focal_length_is_a_doubt_that_names_the_correction_and_the_right_one_is_none(factor, correction):
+    for seed in range(4):
+        doubt = focal_doubt(shots_of(scaled(lambda k: k * [[factor, 1, 1], [1, factor, 1], [1, 1, 1]])(seen(seed))))
+        assert f"{correction} times" in doubt if correction else doubt == ""
+
+
 @DRAWS
 @given(seed=st.integers(0, 10**6))
 @pytest.mark.parametrize("write", [pytest.param(idr, marks=pytest.mark.slow), nerf])
 def test_a_capture_with_a_mistake_is_refused_with_its_name(tmp_path, write, seed):
     views = seen(seed)
     write(tmp_path, views)
-    assert np.median(read_capture(tmp_path, READ).fit.overlaps) > 0.85
+    capture = read_capture(tmp_path, READ)
+    assert np.median(capture.fit.overlaps) > 0.85 and not any("focal" in note for note in capture.notes)
     for words, change in (MISTAKES["inverse"], MISTAKES["shares"], MISTAKES["millimetres"]):
         if write is idr and "shares" in words:
             words, change = (

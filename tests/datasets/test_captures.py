@@ -20,9 +20,10 @@ from datasets.files.captures.frames import OPENGL
 from datasets.files.captures.hull import carve, hull_mesh, measure_mask_fit
 from datasets.files.captures.layouts import find_layout
 from datasets.files.captures.take import _same_aspect, read_image, read_shot
-from datasets.files.own_photographs import Capture, ReadSettings, read_capture
+from datasets.files.own_photographs import OwnPhotographs, ReadSettings, read_capture
 from datasets.shot import Shot
 from renderers.checks import BadInput
+from tests.composing import composed
 from tests.looped import each
 from tests.made_photographs import (
     CENTRE,
@@ -263,15 +264,14 @@ def test_a_missing_image_leaves_its_camera_out(tmp_path, capsys):
     assert (tmp_path / "photos.png").stat().st_size > 10_000
 
 
-def test_the_shown_sphere_is_that_of_a_run_without_the_photographs_it_holds_out(tmp_path, monkeypatch):
+def test_the_sphere_is_that_of_a_run_and_a_doubtful_focal_length_is_noted(tmp_path, capsys, monkeypatch):
     nerf(tmp_path)
-    captures: list[Capture] = []
-    draw = photos.draw
-    monkeypatch.setattr(photos, "draw", lambda capture: captures.append(capture) or draw(capture))
+    monkeypatch.setattr(own_photographs, "focal_doubt", lambda shots: "it is doubtful")
     assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 0
-    of_run, of_all = (read_capture(tmp_path, ReadSettings(128, held_out=held_out)) for held_out in (8, None))
-    (shown,) = captures
-    assert np.array_equal(shown.to_world, of_run.to_world) and not np.array_equal(shown.to_world, of_all.to_world)
+    out, task = capsys.readouterr().out, composed("task=reconstruction").task
+    photographs = OwnPhotographs(str(tmp_path), masks=True, axes="stated", images=None, unchecked=False)
+    assert photographs.capture(task.longest, task.held_out).summary in out and "note: it is doubtful" in out
+    assert read_capture(tmp_path, ReadSettings(task.longest)).summary not in out
 
 
 def test_the_photographs_that_fit_worst_are_named(tmp_path, capsys):
