@@ -9,6 +9,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from bench.pictures.style import SCREEN, bare, silhouette_image
+from bench.records.results import RESULTS
 from bench.tables import choice
 from datasets.files.captures.frames import AXES
 from datasets.files.captures.hull import MaskFit

@@ -12,7 +12,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
 
-from bench import photos
 from bench.photos import main
 from datasets.files import own_photographs
 from datasets.files.captures.formats.choy import _from_angles
