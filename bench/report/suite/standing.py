@@ -126,7 +126,7 @@ def _with_errors(runs: pd.DataFrame) -> pd.DataFrame:
         index = pd.MultiIndex.from_frame(runs[KEY])
         return pd.Series(values.reindex(index).to_numpy(dtype=float), runs.index)
 
-    finite = runs[np.isfinite(runs["start"])]
+    finite = runs[np.isfinite(runs["start"]) & ~runs["tuned"]]
     sound = finite[finite["ok"] | ~finite.groupby(KEY)["ok"].transform("any")]  # those that ended ok, if any
     least = runs[~runs["tuned"]].groupby(KEY)["final"].min().clip(lower=MIN_LOG_ERROR)
     stated = [_reference(*line) for line in zip(runs["set"], runs["scene"], strict=True)]
