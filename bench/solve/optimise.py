@@ -152,9 +152,10 @@ def with_affordable_rays(task: Any, make_problem: Callable[[Any], Any]) -> Any:
     """
     if task.pixel_block:
         return make_problem(task)
+    without_held_out = replace(task.optimiser, ends=ITERATIONS)  # else the first blocks would be larger than the last
     for block in BLOCKS:
         sampled = replace(task, pixel_block=block)
-        problem = make_problem(sampled)
+        problem = make_problem(replace(sampled, optimiser=without_held_out))
         with suppress(CannotContinue):  # the loop reports it
             problem.loss(Iteration(0, task.optimiser.iterations - 1))["total"].backward()
         if task.optimiser.afforded_iterations * problem.counts.cost <= (task.optimiser.budget or inf):

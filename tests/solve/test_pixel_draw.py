@@ -13,11 +13,13 @@ from bench.solve.optimise import (
     OptimiserSettings,
     StartSettings,
     optimise,
+    with_affordable_rays,
 )
 from bench.solve.pixel_draw import PixelDraw
 from renderers.checks import BadInput
 from renderers.field import Counts
 from tests.runner.driving import record_of
+from tests.solve.test_optimise import Sampled
 
 CPU = torch.device("cpu")
 
@@ -102,6 +104,25 @@ def test_observations_of_which_no_tenth_can_be_held_out_are_refused():
     observed[0, :9] = True
     with pytest.raises(BadInput, match="9 pixels with depth have no tenth to hold out"):
         PixelDraw(observed, 1, 0, holds_out=True)
+
+
+class Drawn(Falling):
+    """A problem in which a pixel of 32 x 32 costs one field evaluation."""
+
+    def __init__(self, task: Sampled) -> None:
+        super().__init__(falls=3)
+        holds_out = task.optimiser.ends == HELD_OUT
+        self.draw = PixelDraw(torch.ones(32, 32, dtype=torch.bool), task.pixel_block, 0, holds_out=holds_out)
+
+    def loss(self, iteration: int) -> dict[str, torch.Tensor]:
+        pixels = self.draw.pixels(iteration)
+        self.counts.value += 32 * 32 if pixels is None else len(pixels)
+        return {"total": self.parameters[0].square().sum()}
+
+
+def test_the_budget_pays_for_the_last_blocks_not_only_for_the_larger_first_ones():
+    task = Sampled(OptimiserSettings(100, 1e-3, "constant", 40 * 16**2, HELD_OUT))
+    assert with_affordable_rays(task, Drawn).draw.blocks == [4, 2]
 
 
 SMOKE = ("task=completion", "dataset=sofa", "scale=smoke", "evaluation.grid=16", "evaluation.picture=null")
