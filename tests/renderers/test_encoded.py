@@ -1,5 +1,6 @@
 """Networks of encoded points: features against closed forms, and slopes in float64 against central differences."""
 
+from dataclasses import replace
 from math import pi
 
 import pytest
@@ -59,6 +60,19 @@ def test_slopes_are_those_of_central_differences(name):
     assert (off < 1e-4).double().mean() > 0.98  # except within a step of a cell's side or of a ReLU's bend
     with torch.no_grad():
         torch.testing.assert_close(field(POINTS.view(10, 20, 3)), field(POINTS).view(10, 20))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_hash_grid_is_finite_and_continuous_at_the_ends_of_its_cube_and_outside(dtype):
+    grid, end = ENCODINGS["hash"], ENCODINGS["hash"].reach
+    axis = torch.tensor([-torch.inf, -9.0, -end - 1e-6, -end, 0.0, end, end + 1e-6, 9.0, torch.inf], dtype=dtype)
+    points = torch.cartesian_prod(axis, axis, axis).requires_grad_()
+    tables = grid.tables.clone().requires_grad_()
+    features = replace(grid, tables=tables)(points)
+    torch.testing.assert_close(features, grid((points * (1 - 1e-6)).clamp(-end, end)), rtol=0, atol=1e-3)
+    slopes, of_tables = torch.autograd.grad(features.square().sum(), (points, tables))
+    assert features.isfinite().all() and slopes.isfinite().all() and of_tables.isfinite().all()
+    assert (slopes[(points.abs() > end + 1e-5)] == 0).all() and (of_tables != 0).any()
 
 
 def test_the_slopes_of_a_width_are_counted_differences_in_losses_and_for_colours():
