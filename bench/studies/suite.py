@@ -313,7 +313,7 @@ def failures(made: Standing) -> str:
         + " and ".join(f"{units(key[1])} ({line.failed} of {line.runs})" for key, line in at_budgets.iterrows())
         for (row, name), at_budgets in most.groupby(level=["row", "set"], sort=False)
     ]
-    return f"{'; '.join(names)}; {failed or 'none'} of {runs} other runs failed."
+    return f"{'; '.join(names)}; {failed or 'none'} of {runs} others failed."
 
 
 def _first_of_sets(made: Standing) -> str:

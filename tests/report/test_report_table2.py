@@ -116,12 +116,12 @@ def test_a_class_of_shapenet_has_the_published_numbers_of_its_family(tmp_path):
 
 
 def test_captions_name_what_varies_and_a_try_at_smoke(tmp_path):
-    def caption():
-        return page_of(tmp_path, "table2").caption
+    def caption(results=tmp_path):
+        return page_of(results, "table2").caption
 
-    def write(index, seed, **more):
+    def write(index, seed, results=tmp_path, **more):
         settings = {"task": {"points": "100", "_target_": "completion"}, **more}
-        write_run(tmp_path, "table2", REFERENCE, task="completion", dataset="sofa", metrics={"chamfer_l2": 0.001},
+        write_run(results, "table2", REFERENCE, task="completion", dataset="sofa", metrics={"chamfer_l2": 0.001},
                   settings=settings, index=index, seed=seed)  # fmt: skip
 
     write(0, 0)
@@ -132,8 +132,11 @@ def test_captions_name_what_varies_and_a_try_at_smoke(tmp_path):
     assert "Median error over shapes and seeds for each" in caption()
     assert "do not interpret" not in caption()
     write(0, 0, scale={"name": "smoke"})
-    assert caption().startswith("Made at scale=smoke, to try things out: do not interpret these numbers.")
-    assert "Median error over one shape for each" in caption()
+    assert "do not interpret" not in caption()  # it has runs of a larger scale
+    write(0, 0, tmp_path / "tries", scale={"name": "smoke"})
+    tried = caption(tmp_path / "tries")
+    assert tried.startswith("Made at scale=smoke, to try things out: do not interpret these numbers.")
+    assert "Median error over one shape for each" in tried
 
 
 def test_the_oracle_is_of_all_of_the_tables_shapes(tmp_path):
