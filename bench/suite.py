@@ -39,7 +39,7 @@ from bench.report.suite.attempts import (
     write_attempts,
 )
 from bench.report.suite.standing import KEY, Standing, units
-from bench.report.suite.tuned import CANDIDATES, STATED, chosen_settings, setting_overrides
+from bench.report.suite.tuned import CANDIDATES, STATED, Chosen, chosen_settings, setting_overrides
 from bench.report.write import paper
 from bench.report.write.html import MAX_MESHES, page_lock, write_page
 from bench.report.write.table import percent
@@ -150,13 +150,13 @@ def shipped_rows() -> set[str]:
 def _sweeps(options: dict[str, str], overrides: list[str], results_dir: Path) -> list[tuple[str, list[str]]]:
     """The title of each sweep and its overrides, one per set and setting; or ValueError without a setting."""
     sets, sweeps = options["set"].split(","), list[tuple[str, list[str]]]()
-    size = "smoke" if options["suite"] == "smoke" else "quick"
-    size = size if options["setting"] == CANDIDATES else options["suite"]
+    size = "quick" if (options["setting"], options["suite"]) == (CANDIDATES, "core") else options["suite"]
+    chosen = chosen_settings(paper.SHIPPED, results_dir)[0] if options["setting"] == "tuned" else {}
     for position, name in enumerate(sets, 1):
         title = f"set {position} of {len(sets)}: {name}"
         keys = [f"+experiment={EXPERIMENT_PREFIX}{name}", f"sizes.chosen={suite().sizes[size]}"]
         if options["setting"] == "tuned":
-            sweeps += _tuned_sweeps(title, name, keys, options["budget"].split(","), overrides, results_dir)
+            sweeps += _tuned_sweeps(title, name, keys, options["budget"].split(","), overrides, chosen)
             continue
         budgets = ",".join(_budget(name, budget) for budget in options["budget"].split(","))
         keys += [f"{BUDGET_KEY}={budgets}", *overrides]
@@ -173,13 +173,13 @@ def _budget(set_name: str, budget: str) -> str:
 
 
 def _tuned_sweeps(
-    title: str, set_name: str, keys: list[str], budgets: list[str], overrides: list[str], results_dir: Path
+    title: str, set_name: str, keys: list[str], budgets: list[str], overrides: list[str], chosen: Chosen
 ) -> list[tuple[str, list[str]]]:
     """The sweeps of the renderers whose setting is not the set's, by budget and setting; others are printed."""
     label = next((text.partition("=")[2].strip("'\"") for text in overrides if text.startswith("label=")), "")
     others = [text for text in overrides if not text.startswith(("renderer=", "label="))]
     text = f"label='{label or '${renderer._label_}'}{TUNED_SUFFIX}'"
-    chosen, sweeps = chosen_settings(paper.SHIPPED, results_dir), list[tuple[str, list[str]]]()
+    sweeps = list[tuple[str, list[str]]]()
     for budget in budgets:
         renderers = _renderers(overrides) or [name for *key, name in chosen if key == [float(budget), set_name]]
         by_setting = dict[str, list[str]]()

@@ -47,7 +47,8 @@ def breakdown(metrics: Mapping[str, Any], sweep: Mapping[str, Any]) -> str:
     if metrics["severe_successes"] * metrics["mild_trials"] > metrics["mild_successes"] * metrics["severe_trials"]:
         return "has no breakdown: it succeeds more often at the severest severity than at the mildest"
     words = {"mild": "breaks at the mildest severity, ", "severe": "does not break up to the severest severity, "}
-    end = "mild" if metrics["level"] < 0 else "severe" if metrics["level"] > 1 else ""
+    level = metrics["level"] if metrics["level"] is not None else 0.5  # unknown: the severity alone
+    end = "mild" if level < 0 else "severe" if level > 1 else ""
     severity = sweep[end] if end else metrics["breakdown"]
     return f"{words.get(end, 'breaks at ')}{number(severity)} {sweep['unit']}"
 

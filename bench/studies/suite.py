@@ -11,14 +11,13 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, chart, figure_style, format, merge_runs, table
+from bench.report.study import Result, Runs, chart, figure_style, format, merge_runs, table
 from bench.report.suite import standing
 from bench.report.suite.attempts import (
-    EXPERIMENT_PREFIX,
-    PROBLEM_SETTINGS,
     SECOND_START_NOISE,
     attempts_folder,
     gather,
+    selections,
     suite,
 )
 from bench.report.suite.standing import ALPHA, KEY, MAX_LEVEL, Standing, units
@@ -28,10 +27,7 @@ from bench.report.write.table import percent
 
 PLACE = 1
 KEEPS = attempts_folder
-READS = tuple(
-    Selection(f"{EXPERIMENT_PREFIX}{name}", tuple(key for key, *_ in PROBLEM_SETTINGS.values()))
-    for name in suite().errors
-)
+READS = selections()
 COST = "field evaluations, in units"
 CANNOT_RUN = "cannot run"
 MENTIONED_FRACTION_OF_LARGER_ERRORS = 0.05

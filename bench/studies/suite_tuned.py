@@ -4,28 +4,24 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, Selection, figure_style, format, merge_runs, statistics, table
+from bench.report.study import Result, Runs, figure_style, format, merge_runs, statistics, table
 from bench.report.suite.attempts import (
-    EXPERIMENT_PREFIX,
-    PROBLEM_SETTINGS,
     TUNED_SUFFIX,
     Attempt,
     attempts_folder,
     gather,
-    suite,
+    selections,
 )
 from bench.report.suite.standing import ALPHA, KEY, Gathered, Standing, units
 from bench.report.suite.tuned import (
     CANDIDATES,
     STATED,
-    candidate_errors,
+    Chosen,
     candidate_of,
-    candidate_runs,
     chosen_settings,
     renderer_of,
 )
@@ -36,11 +32,7 @@ from bench.report.write.table import percent
 PLACE = 3
 UNITS_OF_COST = 1.0
 KEEPS = partial(attempts_folder, subfolder=CANDIDATES)
-READS = tuple(
-    Selection(f"{EXPERIMENT_PREFIX}{name}", tuple(key for key, *_ in PROBLEM_SETTINGS.values()))
-    for name in suite().errors
-)
-Chosen = dict[tuple[float, str, str], str]
+READS = selections()
 NOTES = (
     "Candidates of a setting are the set's, a third of its learning rate (slower), three times its rate (faster), and "
     "fewer rays for at least 160 iterations. They are the same for all renderers. The silhouette loss is the set's.",
@@ -66,8 +58,8 @@ def make(*several: Runs | None) -> Result:
     """A line per renderer: its progress with the set's settings and with its own, on the same problems."""
     runs = merge_runs(*several)
     gathered = gather(paper.SHIPPED, runs.results_dir, runs.records)
-    folders = (paper.SHIPPED, runs.results_dir)
-    chosen = {key: setting for key, setting in chosen_settings(*folders).items() if key[0] == UNITS_OF_COST}
+    every_choice, problems = chosen_settings(paper.SHIPPED, runs.results_dir)
+    chosen = {key: setting for key, setting in every_choice.items() if key[0] == UNITS_OF_COST}
     tuned = Standing(Gathered(with_chosen_settings(gathered.everything, chosen), [], []))
     keys = {*tuned.complete[[*KEY, "row"]].itertuples(index=False, name=None)}
     shared = [attempt for attempt in gathered.everything if attempt.key[:4] in keys]
@@ -81,7 +73,7 @@ def make(*several: Runs | None) -> Result:
         verdict=verdict(tuned, stated),
         n=_sample(tuned),
         interval="simultaneous 95 % ranks, as on the page of the suite" if lines else "",
-        remarks=[*NOTES, *_notes(chosen, folders)] if lines else [],
+        remarks=[*NOTES, *_notes(chosen, problems)] if lines else [],
         columns=[
             table.text("row", "Renderer"),
             table.text("stated_text", "The set's settings"),
@@ -127,13 +119,12 @@ def verdict(tuned: Standing, stated: Standing) -> str:
     )
 
 
-def _notes(chosen: Chosen, folders: Sequence[Path]) -> list[str]:
+def _notes(chosen: Chosen, problems: dict[str, int]) -> list[str]:
     counts = Counter(setting.replace("_", " ") for setting in chosen.values()).most_common()
-    _, of_sets = candidate_errors(candidate_runs(folders))
-    problems = ", ".join(f"{count} of {name}" for name, count in of_sets.items())
+    sample = ", ".join(f"{count} of {name}" for name, count in problems.items())
     return [
         f"Chosen, over renderers and sets: {', '.join(f'{name} {count} times' for name, count in counts)}.",
-        f"Validation problems per renderer: {problems}. So few problems may choose a setting by chance.",
+        f"Validation problems per renderer: {sample}. So few problems may choose a setting by chance.",
         f"The runs of the candidates are in the folder `{CANDIDATES}` next to those of the suite.",
     ]
 

@@ -29,6 +29,7 @@ from bench.records.record import (
 from bench.records.results import curve_lines
 from bench.report.data.kept import READ_ERRORS, UNMEASURED
 from bench.report.data.records import Record, family, grouped, loop_seconds, setting
+from bench.report.data.runs import Selection
 from bench.tables import CONF, read_yaml
 
 SUITE_FOLDER = "suite"  # it has a folder per version
@@ -93,6 +94,12 @@ def _units(set_name: str, budget: float) -> float:
     return float(f"{budget / suite().units[set_name]:.3g}")
 
 
+def selections() -> tuple[Selection, ...]:
+    """The runs of each set, for a study."""
+    settings = tuple(key for key, *_ in PROBLEM_SETTINGS.values())
+    return tuple(Selection(f"{EXPERIMENT_PREFIX}{name}", settings) for name in suite().errors)
+
+
 @dataclass(frozen=True)
 class Attempt:
     """A run of a renderer on a problem of the suite."""
@@ -145,11 +152,8 @@ class Attempt:
 
 def attempts_of(records: Iterable[Record], results_dir: Path, split: str = "test") -> list[Attempt]:
     """The attempts among the records of a results folder; planned runs and those of other splits are none."""
-    folder = results_dir / "runs"
-    attempts = (
-        _attempt(record, folder / record["folder"]) for record in records if record["config"].get("split") == split
-    )
-    return [attempt for attempt in attempts if attempt]
+    of_split = (record for record in records if record["config"].get("split") == split)
+    return [attempt for record in of_split if (attempt := _attempt(record, results_dir / "runs" / record["folder"]))]
 
 
 def newest_attempts(attempts: Iterable[Attempt]) -> list[Attempt]:
@@ -243,10 +247,8 @@ def attempts_folder(results_dir: Path, subfolder: str = "") -> Path:
 
 def write_attempts(attempts: Iterable[Attempt], results_dir: Path, subfolder: str = "") -> list[Path]:
     """Merges attempts into those of a results folder; returns a file per row. Raises ValueError for a damaged file."""
-    folder, (stored, problems) = (
-        attempts_folder(results_dir, subfolder),
-        read_attempts(results_dir, subfolder=subfolder),
-    )
+    folder = attempts_folder(results_dir, subfolder)
+    stored, problems = read_attempts(results_dir, subfolder=subfolder)
     if problems:
         raise ValueError(
             f"{folder} has files that cannot be read: {'; '.join(problems)}. Repair them or move them away."

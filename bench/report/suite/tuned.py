@@ -4,7 +4,6 @@
 number of rays per iteration. `python -m bench.suite setting=candidates` runs them on validation shapes.
 """
 
-from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from bench.tables import CONF, read_yaml
 CANDIDATES = "candidates"  # the folder of their attempts, next to the files of rows
 STATED = "stated"  # the candidate with the set's setting
 KEY = ["budget", "set", "renderer"]
+Chosen = dict[tuple[float, str, str], str]  # the candidate by `KEY`
 
 
 @cache
@@ -58,20 +58,16 @@ def renderer_of(attempt: Attempt) -> str:
     return attempt.row if attempt.preset == CUSTOM else attempt.preset
 
 
-def candidate_runs(folders: Iterable[Path]) -> list[Attempt]:
-    """The attempts of candidates in results folders, the later ones last. Raises ValueError for a damaged file."""
+def chosen_settings(*folders: Path) -> tuple[Chosen, dict[str, int]]:
+    """The best candidate by budget, set and renderer, of the attempts in results folders; later folders count more.
+
+    It has the smallest geometric mean of final errors on validation shapes. A failed run counts with its initial error.
+    Problems that lack a candidate are left out. Also returns the smallest number of problems of a renderer, by set.
+    Raises ValueError for a damaged file.
+    """
     attempts, problems = read_attempts(*folders, subfolder=CANDIDATES)
     if problems:
         raise ValueError(f"runs of candidates cannot be read: {'; '.join(problems)}")
-    return attempts
-
-
-def candidate_errors(attempts: Iterable[Attempt]) -> tuple[pd.DataFrame, dict[str, int]]:
-    """Geometric means of the final errors on validation shapes, a column per candidate, by budget, set and renderer.
-
-    A failed run counts with its initial error. Problems that lack a candidate are left out. Also returns the smallest
-    number of problems of a renderer, by set.
-    """
     lines = [
         {
             **{"budget": attempt.budget, "set": attempt.set, "renderer": renderer_of(attempt)},
@@ -83,12 +79,5 @@ def candidate_errors(attempts: Iterable[Attempt]) -> tuple[pd.DataFrame, dict[st
     frame = pd.DataFrame(lines, columns=[*KEY, "problem", "candidate", "error"])
     table = frame.pivot_table(index=[*KEY, "problem"], columns="candidate", values="error", aggfunc="last")
     table = table.reindex(columns=[*suite().candidates]).dropna()
-    counts = table.groupby(KEY).size().groupby("set").min()
-    return np.exp(table.groupby(KEY).mean()), counts.to_dict()
-
-
-def chosen_settings(*folders: Path) -> dict[tuple[float, str, str], str]:
-    """The best candidate by budget, set and renderer. Raises ValueError."""
-    errors, _ = candidate_errors(candidate_runs(folders))
-    best: dict[Any, Any] = errors.idxmin(axis=1).to_dict() if len(errors) else {}
-    return best
+    best: dict[Any, Any] = table.groupby(KEY).mean().idxmin(axis=1).to_dict() if len(table) else {}
+    return best, table.groupby(KEY).size().groupby("set").min().to_dict()

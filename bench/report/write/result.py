@@ -60,7 +60,7 @@ JSON_KEYS = {"order": "place"}  # fields of Shown with another name in the shipp
 # Characters that Markdown or HTML would read as signs. Brackets are, where they could form a link or a check box.
 _MARKDOWN_SIGN = r"[\\`*|<]|&(?=#?\w+;)"
 _MARKDOWN_CODE = r"`[\w.=/+-]+(?: [\w.=/+-]+)*`"  # such as `not_reached`
-_MARKDOWN_LINK = re.compile(r"\][(\[:]|\]\s*\[|^\[[ xX]\]")
+_MARKDOWN_LINK = re.compile(r"\][(:]|\]\s*\[|^\[[ xX]\]")
 
 
 @dataclass(frozen=True)
