@@ -194,6 +194,20 @@ class Area:
         return self.weight * (rendering.opacity.mean(-1) - observed.covered).square().mean()
 
 
+@dataclass(frozen=True)
+class AreaOrOther:
+    """`Area` for a rendering with opacities that have a gradient, another loss for any other rendering."""
+
+    area: Area
+    other: SilhouetteLoss
+
+    def __call__(
+        self, renderer: Renderer, field: Field, rays: Rays, rendering: Rendering, observed: RayObservation
+    ) -> Float[Tensor, ""]:
+        loss = self.other if rendering.volume is None else self.area
+        return loss(renderer, field, rays, rendering, observed)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SurfaceRenderer(ABC):
     """The base of renderers whose hits have the exact gradient, and whose mask loss is IDR's.

@@ -80,6 +80,13 @@ def test_the_loss_of_a_paper_equals_that_of_its_renderer(renderer, loss):
         assert of_sphere(instance, chosen_loss, mask) == of_sphere(instance, renderer_loss, mask)
 
 
+@each("renderer, loss, weight", [("neus", "area", 10), ("relaxed_boundary", "area", 10), ("dist", "hinge", 1)])
+def test_area_or_hinge_is_the_area_loss_of_renderers_with_opacities(renderer, loss, weight):
+    instance, mask = at_iteration(load("renderer", renderer), 0), [True] * 4 + [False]
+    expected = [weight * number for number in of_sphere(instance, load("silhouette", loss), mask)]
+    assert of_sphere(instance, load("silhouette", "area_or_hinge"), mask) == pytest.approx(expected)
+
+
 @each("loss", LOSSES)
 @each("renderer", ["dist", "dvr_64", "idr", "naive", "newton"])
 def test_every_loss_grows_a_sphere_that_is_too_small_and_shrinks_one_that_is_too_large(renderer, loss):

@@ -573,12 +573,12 @@ def test_the_runtime_of_a_unit_is_of_timed_runs_of_one_machine():
 
 def test_every_scene_has_every_set_and_amounts_rotate_over_the_scenes_of_a_family():
     problems = attempts.problems_of("core")
-    assert len(problems) == 2 * 168 and {key[2] for key in problems} == {1, 10}
+    assert len(problems) == 2 * 192 and {key[2] for key in problems} == {1, 10}
     scenes = Counter(text.split(",")[0] for _, text, budget in problems if budget == 1)
-    assert len(scenes) == 24 and {*scenes.values()} == {7}
+    assert len(scenes) == 24 and {*scenes.values()} == {8}
     sofas = Counter(text.split(", ")[1] for name, text, budget in problems if "sofa" in text and name == "complete")
     assert sofas == {"dense points": 4, "100 points": 4, "20 points": 4}
-    assert {key[2] for key in attempts.problems_of("quick")} == {1} and len(attempts.problems_of("quick")) == 12 * 5
+    assert {key[2] for key in attempts.problems_of("quick")} == {1} and len(attempts.problems_of("quick")) == 12 * 6
     assert attempts.problems_of("smoke") < attempts.problems_of("core")
 
 
@@ -687,7 +687,7 @@ def test_the_expected_runtime_is_that_of_the_shipped_rows_at_the_budgets_of_the_
     )  # 36 runs of 1 unit, of a second each
     assert quick == "36 runs of each renderer; the shipped ones need about 108 s (A) of one processor"
     assert "72.0 s (B) of" in _expected_runtime({"suite": "quick", "set": "pose", "budget": "1"}, ["b"])
-    seconds = 168 * (2 + 1) + 168 * (2 + 10)
+    seconds = 192 * (2 + 1) + 192 * (2 + 10)
     assert f"{seconds / 60:.1f} min (A)" in _expected_runtime(
         {"suite": "core", "set": ",".join(suite().errors), "budget": "1,10"}, ["new"]
     )
