@@ -30,6 +30,8 @@ FROM_MESH = "By exact first hits of the mesh that evaluation.grid gives within t
 IMAGE_DEFINITIONS = {
     "depth_mae": "Mean absolute difference of camera-z depth over the pixels that are foreground in both the"
     " predicted and the true mask, in scene units; infinite if there is no such pixel.",
+    "depth_bias": "Median difference of camera-z depth to the true one over the same pixels, in scene units: negative"
+    " in front of the true surface; nan if there is no such pixel.",
     "mask_iou": "Number of pixels that are foreground in both masks divided by the number that are foreground"
     " in at least one, from 0 to 1; two empty masks give 1.",
 }
@@ -182,14 +184,18 @@ def view_metrics(view: View, true: View, prefix: str = "") -> dict[str, float]:
     """The metrics of `IMAGE_DEFINITIONS` of a view against the true one, with a prefix to their names.
 
     Depths are compared where both masks are true and the true depth is not 0, which means unknown. There, a depth of
-    NaN counts as an infinite error.
+    NaN counts as an infinite error, of an unknown sign.
     """
     depth, mask, true_mask = true.depth.numpy(), view.mask.numpy(), true.mask.numpy()
     common = mask & true_mask & (depth > 0)
-    error = np.abs(view.depth.numpy()[common].astype(np.float64) - depth[common])
-    error[np.isnan(error)] = np.inf
-    mean = float(error.mean()) if common.any() else np.inf
-    return {f"{prefix}depth_mae": mean, f"{prefix}mask_iou": mask_iou(mask, true_mask)}
+    difference = view.depth.numpy()[common].astype(np.float64) - depth[common]
+    error, any_common = np.where(np.isnan(difference), np.inf, np.abs(difference)), bool(common.any())
+    metrics = {
+        "depth_mae": float(error.mean()) if any_common else np.inf,
+        "depth_bias": float(np.median(difference)) if any_common else np.nan,
+        "mask_iou": mask_iou(mask, true_mask),
+    }
+    return {f"{prefix}{name}": value for name, value in metrics.items()}
 
 
 def chamfer_only(state: State) -> dict[str, float]:

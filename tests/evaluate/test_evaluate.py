@@ -124,7 +124,7 @@ def test_no_renderer_judges_itself(inputs):
     fat = replace(inputs, renderer=load("renderer", "idr", epsilon=0.05))
     thin, result = evaluate(State(sphere(RADIUS), inputs)).metrics, evaluate(State(sphere(RADIUS), fat)).metrics
     differing = {name for name in thin if result[name] != thin[name]}
-    assert differing == {"own_mask_iou", "own_depth_mae"}
+    assert differing == {"own_mask_iou", "own_depth_mae", "own_depth_bias"}
     assert result["own_mask_iou"] < 0.95 < thin["own_mask_iou"]
 
 

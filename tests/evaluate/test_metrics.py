@@ -1,4 +1,5 @@
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,7 +111,7 @@ def test_image_worked_example():
     truth_depth = np.array([[1.0, 2.25], [np.nan, 0.0]], dtype=np.float32)
     predicted_mask, truth_mask = np.array([[True, True], [True, False]]), np.array([[True, True], [False, False]])
     measured = view_metrics(view(predicted_depth, predicted_mask), view(truth_depth, truth_mask))
-    assert measured == pytest.approx({"depth_mae": 0.375, "mask_iou": 2 / 3})
+    assert measured == pytest.approx({"depth_mae": 0.375, "depth_bias": 0.125, "mask_iou": 2 / 3})
 
 
 def test_image_edges():
@@ -119,12 +120,16 @@ def test_image_edges():
     def measured(depth: np.ndarray, mask: np.ndarray, true_mask: np.ndarray) -> tuple[float, ...]:
         return tuple(view_metrics(view(depth, mask), view(np.ones((2, 3)), true_mask)).values())
 
-    assert measured(depth, every, every) == (0, 1)
-    assert measured(depth, none, every) == (np.inf, 0)
-    assert measured(depth, none, none) == (np.inf, 1)
-    assert measured(depth * np.nan, every, every) == (np.inf, 1)
+    def equal(*expected: float) -> Any:
+        return pytest.approx(expected, nan_ok=True)
+
+    assert measured(depth, every, every) == equal(0, 0, 1)
+    assert measured(depth / 2, every, every) == equal(0.5, -0.5, 1)  # in front
+    assert measured(depth, none, every) == equal(np.inf, np.nan, 0)
+    assert measured(depth, none, none) == equal(np.inf, np.nan, 1)
+    assert measured(depth * np.nan, every, every) == equal(np.inf, np.nan, 1)
     unknown = np.array([[1.0, 0, 0], [1, 1, 1]])  # 0 is no depth
-    assert view_metrics(view(depth, every), view(unknown, every)) == {"depth_mae": 0, "mask_iou": 1}
+    assert view_metrics(view(depth, every), view(unknown, every)) == {"depth_mae": 0, "depth_bias": 0, "mask_iou": 1}
 
 
 def test_drawn_points_are_different_ones():

@@ -28,6 +28,7 @@ from bench.report.suite.attempts import (
     suite,
     write_attempts,
 )
+from bench.report.suite.bias import bias_lines, bias_notes, depth_biases
 from bench.report.suite.standing import (
     ALPHA,
     MAX_LEVEL,
@@ -466,10 +467,15 @@ from tests.user_renderer import Mine as Exact
 
 class Shifted(Exact):
     """Source: none. Differentiable in: field and rays. Needs: a distance. Deviates from the paper: its hits are off."""
+    shift = 0.003
     def render(self, field, rays):
         found = super().render(field, rays)
-        points = found.points + 0.03 * rays.directions
-        return type(found)(found.distance + 0.03, found.status, points, found.residual, found.closest)
+        points = found.points + self.shift * rays.directions
+        return type(found)(found.distance + self.shift, found.status, points, found.residual, found.closest)
+
+class Far(Shifted):
+    """Source: none. Differentiable in: field and rays. Needs: a distance. Deviates from the paper: its hits are off."""
+    shift = 0.03
 
 class Slow(Exact):
     """Source: none. Differentiable in: field and rays. Needs: a distance. Deviates from the paper: it sleeps."""
@@ -481,18 +487,21 @@ class Slow(Exact):
 
 @pytest.mark.slow
 def test_a_handicap_is_significant_and_a_twin_is_not_on_twelve_scenes(tmp_path, monkeypatch):
-    """Hits that are off by 0.03 scene units, half a pixel. One of 0.003 is not significant, see bench/README.md."""
+    """Hits that are off by 0.03 scene units, half a pixel, cost progress. An offset of 0.003 shows as depth bias."""
     (tmp_path / "odd.py").write_text(MINE)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path.cwd()}")
     monkeypatch.syspath_prepend(tmp_path)  # the sweep is composed in this process
     results = tmp_path / "results"
     asked = ["set=complete", f"results_dir={results}"]
-    own = {"Exact": "tests.user_renderer.Mine", "Shifted": "odd.Shifted", "Slow": "odd.Slow"}
+    own = {"Exact": "tests.user_renderer.Mine", "Shifted": "odd.Shifted", "Far": "odd.Far", "Slow": "odd.Slow"}
     for label, target in own.items():
         assert main([*asked, "renderer=custom", f"renderer._target_={target}", f"label={label}"]) == 0
     runs = judged(read_attempts(results)[0])
-    pairs = {row: ranking(runs[runs["row"].isin(["Exact", row])]) for row in ("Shifted", "Slow")}
-    assert pairs["Shifted"].better == {("Exact", "Shifted")} and pairs["Shifted"].scenes == 12
+    pairs = {row: ranking(runs[runs["row"].isin(["Exact", row])]) for row in ("Far", "Slow")}
+    assert pairs["Far"].better == {("Exact", "Far")} and pairs["Far"].scenes == 12
+    biases = depth_biases(runs, "Exact").set_index("row")
+    assert biases["significant"].to_dict() == {"Exact": False, "Far": True, "Shifted": True, "Slow": False}
+    assert -0.0045 < biases.loc["Shifted", "difference"] < -0.0015 and biases.loc["Slow", "p"] == 1
     assert pairs["Slow"].better == set() and pairs["Slow"].least_p == 1
     spent = {row: own.sort_values("problem")[["cost", "seconds"]].to_numpy() for row, own in runs.groupby("row")}
     assert (spent["Slow"][:, 0] == spent["Exact"][:, 0]).all()
@@ -691,6 +700,33 @@ def test_the_expected_runtime_is_that_of_the_shipped_rows_at_the_budgets_of_the_
     assert f"{seconds / 60:.1f} min (A)" in _expected_runtime(
         {"suite": "core", "set": ",".join(suite().errors), "budget": "1,10"}, ["new"]
     )
+
+
+def test_a_depth_bias_that_is_equal_over_scenes_is_significant_and_scatter_is_not():
+    """Each row relative to DIST's; runs without a bias, as those of pose, are left out."""
+    biases = {"Dist": [0.0] * 10, "Near": [-0.003, -0.002] * 5, "Wide": [0.1, -0.1] * 5, "Twin": [0.0] * 10}
+    runs = [
+        replace(attempt(row, scene, {0: 1.0, 4e5: 0.1}), depth_bias=values[index])
+        for row, values in biases.items()
+        for index, scene in enumerate(TEN)
+    ]
+    frame = judged([*runs, *(replace(run, set="pose", depth_bias=None) for run in runs)])
+    lines = depth_biases(frame).set_index("row")
+    assert lines["significant"].to_dict() == {"Dist": False, "Near": True, "Twin": False, "Wide": False}
+    assert lines.loc["Near", "difference"] == pytest.approx(-0.0025) and {*lines["set"]} == {"complete"}
+    (note,) = bias_notes(lines.reset_index())
+    assert "in front of its surfaces are those of Near (2.50)" in note and "2 rows cannot be disting" in note
+    (line,) = bias_lines(lines.reset_index(), "Near")
+    assert "0.00250 scene units in front of those of Dist (10 scenes, p = 0.00195, significant)" in line
+    assert depth_biases(frame[frame["set"] == "pose"]).empty
+
+
+def test_a_file_of_attempts_without_a_depth_bias_is_read(tmp_path):
+    (path,) = write_attempts([attempt("Dist", "a", {0: 1.0, 9: 0.5})], tmp_path)
+    table = pd.read_csv(path, dtype=str, keep_default_na=False).drop(columns="depth_bias")
+    table.to_csv(path, index=False)
+    ((read,), problems) = read_attempts(tmp_path)
+    assert read.depth_bias is None and not problems
 
 
 def test_a_second_start_shows_the_spread_and_changes_no_comparison(tmp_path):

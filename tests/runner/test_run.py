@@ -40,7 +40,7 @@ TINY = (
 COMMAND = ("task=completion", "renderer=dist", "scale=smoke")
 ITERATIONS, PIXELS = 20, 32
 SURFACE = {"chamfer_l2", "chamfer_l1", "chamfer_gt_to_pred", "accuracy", "completeness", "fscore", "normal_consistency"}
-IMAGE = {"depth_mae", "mask_iou"}
+IMAGE = {"depth_mae", "depth_bias", "mask_iou"}
 METRICS = SURFACE | IMAGE | {f"own_{name}" for name in IMAGE}
 PICTURES = {"summary", "curve"}
 

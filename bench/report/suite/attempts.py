@@ -8,11 +8,11 @@ import csv
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from functools import cache, lru_cache
 from io import StringIO
 from itertools import product
-from math import inf, isnan
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +130,7 @@ class Attempt:
     settings: str  # a hash of those that the set fixes
     curve: list[list[float]]  # cost, seconds and error at each checkpoint
     overrides: list[str]  # the command line that repeats the run
+    depth_bias: float | None = None  # see `bench.evaluate.evaluate`; None without one
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -204,6 +205,7 @@ def _attempt(record: Record, folder: Path) -> Attempt | None:
         settings=settings_hash(config, set_name, tuned),
         curve=curve,
         overrides=portable_overrides(record.get("overrides", ())),
+        depth_bias=_bias(record["metrics"].get("depth_bias")) if ok else None,
     )
 
 
@@ -211,6 +213,11 @@ def _error(value: Any) -> float:
     """The value as an error; infinite if it is missing or not a number."""
     number = as_number(value)
     return inf if number is None or isnan(number) else number
+
+
+def _bias(value: Any) -> float | None:
+    number = as_number(value)
+    return None if number is None or not isfinite(number) else _rounded(number)
 
 
 def portable_overrides(overrides: Iterable[str]) -> list[str]:
@@ -275,7 +282,9 @@ def _write_lines(path: Path, attempts: list[Attempt]) -> Path:
 def _read_lines(path: Path, changed: int) -> list[Attempt]:
     """Reads the attempts of a file, once per time of its change; raises one of `READ_ERRORS` if it is damaged."""
     with path.open(encoding="utf-8", newline="") as file:
-        lines = [{f.name: _value(line[f.name], f.type) for f in fields(Attempt)} for line in csv.DictReader(file)]
+        table = csv.DictReader(file)
+        stored = [f for f in fields(Attempt) if f.default is MISSING or f.name in (table.fieldnames or ())]
+        lines = [{f.name: _value(line[f.name], f.type) for f in stored} for line in table]
     return [_checked(Attempt(**line)) for line in lines]
 
 

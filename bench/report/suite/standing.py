@@ -68,7 +68,7 @@ def frame_of(attempts: Iterable[Attempt]) -> tuple[pd.DataFrame, dict[str, int]]
     lines = [vars(attempt) | {"ok": attempt.ok, "tuned": attempt.tuned} for attempt in attempts]
     columns = [*Attempt.__dataclass_fields__, "ok", "tuned"]
     frame = pd.DataFrame(lines, columns=columns, dtype=object).sort_values(["started", "final"])
-    frame = frame.astype(dict.fromkeys(("budget", "start", "final", "cost", "waited", "seconds"), float))
+    frame = frame.astype(dict.fromkeys(("budget", "start", "final", "cost", "waited", "seconds", "depth_bias"), float))
     frame = frame.astype({"ok": bool, "tuned": bool}).assign(
         timed=frame["seconds"].notna() & ~(frame["waited"] > MAX_WAIT_FRACTION),
         machine=frame["cpu"] + "; " + frame["device"] + "; " + frame["threads"].map(str) + "; " + frame["kernels"],
