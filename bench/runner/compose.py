@@ -200,6 +200,9 @@ def unknown_key(key: str, config: DictConfig) -> ValueError:
     """The error for a key that a configuration lacks, with similar keys."""
     if key in OPTIONAL_KEYS or (key.startswith("renderer.") and CLASS_PACKAGE_KEY in (config.get("renderer") or ())):
         return ValueError(f"the YAML does not have the key {key!r}: it is set by +{key}=VALUE, with a plus")
+    if key.startswith("hydra.launcher.") and "executor" not in config.hydra.launcher:  # Hydra's own launcher
+        launchers = " or ".join(f"hydra/launcher={name}" for name in group_choices("hydra/launcher"))
+        return ValueError(f"unknown key {key!r}: keys of a launcher need {launchers}")
     names = dotted_keys(config.hydra, "hydra.") if key.startswith("hydra.") else dotted_keys(config)
     return ValueError(f"unknown key {key!r}{nearest(key, names)}")
 

@@ -57,6 +57,7 @@ def assert_one_line(err: str, *words: str) -> None:
     ("dataset=meshes/cow.obj", ("unknown dataset 'meshes/cow.obj'", "dataset=mesh dataset.path=meshes/cow.obj")),
     ("+sede=1", ("unknown key 'sede'", "did you mean seed")),
     ("dataset.index=3", ("unknown key 'dataset.index'", "did you mean index?")),
+    ("hydra.launcher.n_jobs=1", ("unknown key 'hydra.launcher.n_jobs'", "hydra/launcher=workers")),
     ("xyzzy=1", ("unknown key 'xyzzy': none of ", "--cfg job shows them")),
     ("+experiment=fig10", ("unknown experiment 'fig10'", "fig10_focal", "fig10_start", "--config-dir FOLDER")),
     ("task.iterations=3", ("unknown key 'task.iterations'", "task.optimiser.iterations")),
