@@ -41,6 +41,7 @@ from bench.report.suite.attempts import (
 from bench.report.suite.bias import bias_lines, depth_biases
 from bench.report.suite.standing import KEY, Standing, units
 from bench.report.suite.tuned import CANDIDATES, STATED, Chosen, chosen_settings, setting_overrides
+from bench.report.suite.verdicts import undecided
 from bench.report.write import paper
 from bench.report.write.html import MAX_MESHES, page_lock, write_page
 from bench.report.write.table import percent
@@ -235,6 +236,11 @@ def _print_rows(standing: Standing, local: set[str]) -> None:
         ]
         failed = (~standing.complete.loc[standing.complete["row"] == row, "ok"]).sum()
         print(f"{row + (' *' if row in local else ''):<28} {''.join(f'{cell:<16}' for cell in cells)}{failed:>11}")
+    most_scenes = len({problem.partition(",")[0] for _, problem, _ in problems_of("core")})
+    for budget, ranked in standing.rankings.items():
+        if ranked.pairs and not ranked.decidable:
+            more = f" suite=core has {most_scenes} scenes." if ranked.scenes < most_scenes else ""
+            print(f"{undecided(ranked, f'At {units(budget)}')}{more}")
     for (budget, row), sets in standing.cannot_run.items():
         print(f"{row} cannot run in {sets} at {units(budget)}: it pays for too few iterations.")
     for row, count in standing.other_settings.items():

@@ -22,7 +22,7 @@ from bench.report.suite.attempts import (
 )
 from bench.report.suite.bias import PRINTED_FACTOR, bias_notes, depth_biases, scaled
 from bench.report.suite.standing import ALPHA, KEY, MAX_LEVEL, Standing, units
-from bench.report.suite.verdicts import leaders
+from bench.report.suite.verdicts import leaders, undecided
 from bench.report.write import paper
 from bench.report.write.table import percent
 
@@ -45,9 +45,9 @@ PROGRESS = (
     "multiview, area), of the same network's fit to them (reconstruct), or 0.1 degrees (pose). For shapes, most of "
     "it is the distance between two samplings of 10,000 points: smaller differences of surfaces are not seen.",
     "Each iteration compares all pixels, or a random one of each block of 2, 4 or 8 pixels per side: the smallest "
-    "block with which the budget pays for 40 iterations, else the largest. In reconstruct, it draws 256 rays, or 256 "
-    "divided by the pixels of such a block. With fewer than 10 iterations, a run has no result. A renderer for which "
-    "most runs of a set have none cannot run at this budget, and is not compared.",
+    "block with which the budget pays for 40 iterations at their initial cost, else the largest. In reconstruct, it "
+    "draws 256 rays, or 256 divided by the pixels of such a block. With fewer than 10 iterations, a run has no result. "
+    "A renderer for which most runs of a set have none cannot run at this budget, and is not compared.",
     "Learning rates, blurs, samples and sharpness follow the fraction of the budget that is spent. So a run over 10 "
     "units is not the continuation of a run over 1 unit. In a set, all renderers have one learning rate. Except in "
     "area, they have one silhouette loss. Both were chosen in runs of fixed length: 100 iterations in complete, 200 "
@@ -56,8 +56,8 @@ PROGRESS = (
     "Renderers with opacities compare areas, the others have DIST's mask loss. The weights of both losses were chosen "
     "on four validation shapes, for the relaxed boundary and NeuS.",
     f"Significant: by a sign-flip test over scenes, with Holm's correction over all pairs of a budget at {ALPHA:.0%}. "
-    "If more than 5 % of simulated draws of equal renderers have a false pair at that level, no pair counts as "
-    "significant. All scenes are of four families of shapes, so the test covers no others.",
+    f"If more than {100 * MAX_LEVEL:.1f} % of simulated draws of equal renderers have a false pair at that level, "
+    "no pair counts as significant. All scenes are of four families of shapes, so the test covers no others.",
 )
 
 BIAS = (
@@ -66,7 +66,10 @@ BIAS = (
     "shows there, and not in the final error. Sign-flip tests over scenes compare rows with DIST, with Holm's "
     f"correction over rows and sets of a budget at {ALPHA:.0%}."
 )
-TUNED = "Tuned: each renderer with its own learning rate and rays, chosen on validation shapes."
+TUNED = (
+    "Tuned: each renderer with its own learning rate and rays, chosen on validation shapes. With fewer problems than "
+    "other rows of its set, such a row is not comparable with them: the page suite_tuned compares the same problems."
+)
 
 
 def make(*several: Runs | None) -> Result:
@@ -106,7 +109,7 @@ def make_sets(*several: Runs | None) -> Result:
     made = Standing(gather(paper.SHIPPED, runs.results_dir, runs.records))
     reached = made.reached[made.reached["complete"] | made.reached["tuned"]]
     groups, per_budget = reached.groupby(["set", "row"]), reached.groupby(["budget", "set", "row"])
-    lines = groups[["preset"]].first()
+    lines = groups.agg(preset=("preset", "first"), problems=("problem", "nunique"))
     for name, statistic in (("progress", "mean"), ("iterations", "median"), ("rays", "median")):
         values = per_budget[name].agg(statistic).unstack("budget")
         lines = lines.join(values.rename(columns=lambda budget, name=name: f"{name}_{budget:g}"))
@@ -129,13 +132,14 @@ def make_sets(*several: Runs | None) -> Result:
             *PROGRESS,
             "The test is over all sets together, so this page has no intervals.",
             "Iterations and rays are medians over problems. In multiview, neighbouring views count as one ray "
-            "per pixel. Runtimes are medians over runs on a machine without other "
-            f"load: {format.plural(int(lines['timed'].sum()), 'run')}, others are not timed.",
+            "per pixel. Runtimes are medians over runs of all budgets on a machine without "
+            f"other load: {format.plural(int(lines['timed'].sum()), 'run')}, others are not timed.",
             *([TUNED] if reached["tuned"].any() else []),
             *([BIAS, *bias_notes(biases)] if len(biases) else []),
         ],
         columns=[
             *(table.text("set", "Set"), table.text("row", "Renderer")),
+            table.Column("problems", "Problems", show=table.integer),
             *(table.Column(f"progress_{b:g}", f"At {units(b)}", show=percent) for b in budgets),
             *(table.Column(f"iterations_{b:g}", f"Iterations, at {units(b)}", show=table.integer) for b in budgets),
             *(table.Column(f"rays_{b:g}", f"Rays, at {units(b)}", show=table.integer) for b in budgets),
@@ -309,9 +313,7 @@ def verdict(made: Standing) -> str:
             when = f"At {_when(made, budget)}"
             parts.append(f"{leaders(ranked, when)} {pairs} differ.")
         else:
-            scenes = format.plural(ranked.scenes, "scene")
-            rows = f"{len(ranked.progress)} renderers" + ("" if ranked.level else ", whatever their results")
-            parts.append(f"At {units(budget)}, {scenes} cannot decide between {rows}.")
+            parts.append(undecided(ranked, f"At {units(budget)}"))
     return " ".join([*parts, failures(made)])
 
 
@@ -376,7 +378,7 @@ def _notes(made: Standing) -> list[str]:
         if text := _second_starts(made, budget):
             notes.append(text)
         for name in sets if len(sets := _sets_at(made, budget)) > 1 else ():
-            others = standing.ranking(at_budget[at_budget["set"] != name])
+            others = standing.verified_ranking(at_budget[at_budget["set"] != name])
             if ranked.decidable and others.decidable:
                 lead = leaders(others, f"Without the set {name}, at {units(budget)}")
                 order = f"The order is: {'; '.join(others.progress)}. Different pairs: {len(others.better)}."

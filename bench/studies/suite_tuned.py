@@ -37,7 +37,8 @@ NOTES = (
     "Candidates of a setting are the set's, a third of its learning rate (slower), three times its rate (faster), and "
     "fewer rays for at least 160 iterations. They are the same for all renderers. The silhouette loss is the set's.",
     "The mean logarithm of the final errors on validation shapes chooses a candidate for each renderer and set. A "
-    "failed run counts with its initial error. If the set's setting is chosen, its runs count.",
+    "failed run counts with its initial error, and a larger final error with itself. If the set's setting is chosen, "
+    "its runs count.",
     "Significant: as on the page of the suite, by a sign-flip test over scenes with Holm's correction over all pairs "
     f"at {ALPHA:.0%}. Both columns have the same problems.",
 )
@@ -104,7 +105,7 @@ def _sample(tuned: Standing) -> str:
 
 
 def verdict(tuned: Standing, stated: Standing) -> str:
-    """The leaders with their own settings, the pairs that differ in both, and the correlation of both orders."""
+    """The correlation of both orders, the leaders with their own settings, and the pairs that differ in both."""
     if len(tuned.rows) < 2:
         return ""
     ranked, before = tuned.rankings[UNITS_OF_COST], stated.rankings[UNITS_OF_COST]
@@ -113,9 +114,9 @@ def verdict(tuned: Standing, stated: Standing) -> str:
     turned = sum(pair[::-1] in before.better for pair in ranked.better)
     lead = leaders(ranked, f"With their own settings, at {units(UNITS_OF_COST)}")
     return (
-        f"{lead} *{len(ranked.better)}* of {ranked.pairs} pairs differ, with the sets' settings {len(before.better)}; "
-        f"{turned or 'none'} of them in the other direction. "
-        f"Spearman's correlation of both orders is {rho:.2f}."
+        f"Spearman's correlation of both orders is *{rho:.2f}* ({format.plural(len(order), 'renderer')}). {lead} "
+        f"*{len(ranked.better)}* of {ranked.pairs} pairs differ, with the sets' settings {len(before.better)}; "
+        f"{turned or 'none'} of them in the other direction."
     )
 
 

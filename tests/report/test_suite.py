@@ -346,6 +346,7 @@ def test_a_few_problems_of_ones_own_are_compared_with_shipped_rows_at_these_alon
     table = (own / "paper" / "suite.md").read_text()
     assert "| Dist |" in table and "| Mine |" in table and "at 1 unit: 1 problem of 1 scene" in table
     assert "1 scene cannot decide between 2 renderers" in table
+    assert "1 scene cannot decide between 2 renderers, whatever their results. suite=core has 24 scenes." in said
     assert [one.row for one in read_attempts(own)[0]] == ["Mine"]
 
 
@@ -395,6 +396,7 @@ def test_a_tuned_row_changes_no_comparison_and_has_lines_in_its_sets(tmp_path, m
     nothing = [None] * (len(study.READS) - 1)
     lines = study.make_sets(Runs(study.READS[0], tmp_path / "none", []), *nothing).lines
     assert [line["row"] for line in lines] == ["B", "Dist", "Dist, tuned"] and lines[2]["progress_1"] == 1
+    assert [line["problems"] for line in lines] == [8, 8, 7]  # means over other problems are not compared
 
 
 def test_each_renderer_has_the_candidate_that_is_best_on_validation_shapes(tmp_path, capsys):
@@ -449,7 +451,8 @@ def test_with_its_own_setting_each_renderer_is_compared_on_the_same_problems(tmp
     of_b, of_dist = ((line["stated"], line["own"]) for line in result.lines)
     assert of_b[0] < 0.6 < of_b[1] and min(of_dist) > 0.95  # without stated references, the best row decides
     assert result.figure is not None
-    assert "correlation of both orders is -1.00" in result.verdict and "1 of complete" in " ".join(result.remarks)
+    assert result.verdict.startswith("Spearman's correlation of both orders is *-1.00* (2 renderers).")
+    assert "1 of complete" in " ".join(result.remarks)
 
 
 def test_candidates_are_the_same_for_all_renderers_on_validation_shapes():
@@ -616,6 +619,14 @@ def test_a_budget_with_only_some_of_the_sets_names_them(tmp_path, monkeypatch):
     shown = page([*runs, *others, *half], tmp_path / "half", monkeypatch)
     fewer = [note for note in study._notes(shown) if note.startswith("At 10 units, complete has ")]
     assert fewer == ["At 10 units, complete has 5 of its 10 problems."]
+
+
+def test_an_order_without_a_set_is_left_out_if_equal_rows_often_differ_in_it(tmp_path, monkeypatch):
+    runs = made([("Dist", 0.5, 100.0), ("B", 0.01, 300.0)], TEN)
+    shown = page([*runs, *(replace(run, set="pose") for run in runs)], tmp_path, monkeypatch)
+    assert sum(note.startswith("Without the set") for note in study._notes(shown)) == 2
+    monkeypatch.setattr("bench.report.suite.standing.simulated_level", lambda of_sets: 0.2)
+    assert not any(note.startswith("Without the set") for note in study._notes(shown))
 
 
 def test_without_anything_to_compare_both_pages_are_empty(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""The leaders of a ranking, as a sentence."""
+"""The leaders of a ranking, or that it has none, as a sentence."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -30,6 +30,12 @@ def leaders(ranked: Ranking, when: str) -> str:
         return f"{when}, {rows[0]} makes significantly more progress than all but {others}."
     than = f"significantly more than {less}" if behind else "and cannot be distinguished from any other"
     return f"{when}, {rows[0]} makes the most progress, {than}."
+
+
+def undecided(ranked: Ranking, when: str) -> str:
+    """That a ranking is not decidable: for its few scenes alone, or for its simulated level."""
+    rows = f"{len(ranked.progress)} renderers" + ("" if ranked.level else ", whatever their results")
+    return f"{when}, {plural(ranked.scenes, 'scene')} cannot decide between {rows}."
 
 
 def short_names(rows: Iterable[str]) -> dict[str, str]:
