@@ -17,6 +17,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 from bench.records.format import MISSING, number, plural, seconds
@@ -39,9 +40,9 @@ from bench.report.suite.attempts import (
     write_attempts,
 )
 from bench.report.suite.bias import bias_lines, depth_biases
-from bench.report.suite.standing import KEY, Standing, units
+from bench.report.suite.standing import KEY, Standing, units, verified_ranking
 from bench.report.suite.tuned import CANDIDATES, STATED, Chosen, chosen_settings, setting_overrides
-from bench.report.suite.verdicts import undecided
+from bench.report.suite.verdicts import row_alone, undecided
 from bench.report.write import paper
 from bench.report.write.html import MAX_MESHES, page_lock, write_page
 from bench.report.write.table import percent
@@ -241,6 +242,9 @@ def _print_rows(standing: Standing, local: set[str]) -> None:
         if ranked.pairs and not ranked.decidable:
             more = f" suite=core has {most_scenes} scenes." if ranked.scenes < most_scenes else ""
             print(f"{undecided(ranked, f'At {units(budget)}')}{more}")
+    for (budget, runs), row in product(standing.complete.groupby("budget"), sorted(local)):
+        if row in {*runs["row"]} and runs["row"].nunique() > 1:
+            print(row_alone(verified_ranking(runs, row), row, f"At {units(budget)}"))
     for (budget, row), sets in standing.cannot_run.items():
         print(f"{row} cannot run in {sets} at {units(budget)}: it pays for too few iterations.")
     for row, count in standing.other_settings.items():

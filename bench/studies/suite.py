@@ -131,9 +131,9 @@ def make_sets(*several: Runs | None) -> Result:
         remarks=[
             *PROGRESS,
             "The test is over all sets together, so this page has no intervals.",
-            "Iterations and rays are medians over problems. In multiview, neighbouring views count as one ray "
-            "per pixel. Runtimes are medians over runs of all budgets on a machine without "
-            f"other load: {format.plural(int(lines['timed'].sum()), 'run')}, others are not timed.",
+            "Iterations and rays are medians over problems. In multiview, neighbouring views count as one ray per "
+            "pixel. Runtimes are medians over runs at 1 unit on a machine without other load: "
+            f"{format.plural(int(lines['timed'].sum()), 'run')}, others are not timed.",
             *([TUNED] if reached["tuned"].any() else []),
             *([BIAS, *bias_notes(biases)] if len(biases) else []),
         ],

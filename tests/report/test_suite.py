@@ -45,7 +45,7 @@ from bench.report.suite.standing import (
     with_progress,
 )
 from bench.report.suite.tuned import CANDIDATES, setting_overrides, stated_rate
-from bench.report.suite.verdicts import leaders
+from bench.report.suite.verdicts import leaders, row_alone
 from bench.report.write import chart
 from bench.studies import suite as study
 from bench.studies import suite_tuned
@@ -536,6 +536,20 @@ def test_equal_rows_differ_in_at_most_one_of_twenty_draws(shipped_standing):
         assert 0 < simulated_level(runs, draws=500) <= MAX_LEVEL
 
 
+def test_a_row_alone_is_decided_on_fewer_scenes_than_all_pairs():
+    """Twelve rows on twelve scenes: 66 pairs cannot have a significant one, 11 can. A copy of a row does not differ."""
+    errors = {f"Row {number}": 0.01 * 1.2**number for number in range(10)} | {"Dist": 0.02, "Mine": 0.012}
+    runs = judged(made([(row, error, 100.0) for row, error in errors.items()], [*TEN, "vase test 10", "vase test 11"]))
+    assert not verified_ranking(runs).better
+    alone = verified_ranking(runs, "Mine")
+    assert alone.pairs == 11 and {row for pair in alone.better for row in pair} == {*errors} - {"Row 1"}
+    text = row_alone(alone, "Mine", "At 1 unit")
+    assert text.startswith("Mine at 1 unit: significantly more progress than Row 2, Row 3, Dist, Row 4, ")
+    assert "less than Row 0; no significant difference from Row 1 (12 scenes, Holm's correction over 11" in text
+    few = ranking(runs[runs["scene"].isin(TEN[:4])], "Mine")
+    assert row_alone(few, "Mine", "At 1 unit") == "At 1 unit, 4 scenes cannot decide between Mine and others."
+
+
 def test_a_budget_at_which_equal_rows_often_differ_has_no_significant_pair():
     """Twelve scenes of which one decides: its sign is missing in a third of all draws."""
     progress = {"A": [0.5] * 12, "B": [0.49] * 11 + [0.6]}
@@ -625,7 +639,7 @@ def test_an_order_without_a_set_is_left_out_if_equal_rows_often_differ_in_it(tmp
     runs = made([("Dist", 0.5, 100.0), ("B", 0.01, 300.0)], TEN)
     shown = page([*runs, *(replace(run, set="pose") for run in runs)], tmp_path, monkeypatch)
     assert sum(note.startswith("Without the set") for note in study._notes(shown)) == 2
-    monkeypatch.setattr("bench.report.suite.standing.simulated_level", lambda of_sets: 0.2)
+    monkeypatch.setattr("bench.report.suite.standing.simulated_level", lambda of_sets, row="": 0.2)
     assert not any(note.startswith("Without the set") for note in study._notes(shown))
 
 

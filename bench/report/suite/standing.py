@@ -195,10 +195,14 @@ class Ranking:
         return "–".join(dict.fromkeys((str(1 + above), str(len(self.progress) - below))))
 
 
-def ranking(runs: pd.DataFrame) -> Ranking:
-    """Ranks rows with the same problems by sign flips of scenes' differences, with Holm's correction over all pairs."""
+def ranking(runs: pd.DataFrame, row: str = "") -> Ranking:
+    """Ranks rows with the same problems by sign flips of scenes' differences, with Holm's correction over all pairs.
+
+    Args:
+        row: the tested pairs are those of this row alone; empty: all pairs.
+    """
     scores = by_scene(runs)
-    first, second = np.triu_indices(scores.shape[1], 1)
+    first, second = _pairs([*scores.columns], row)
     differences = scores.to_numpy()[:, first] - scores.to_numpy()[:, second]
     pairs, p_values = zip(scores.columns[first], scores.columns[second], strict=True), flips.p_values(differences)
     significant = zip(pairs, differences.sum(axis=0), statistics.holm(p_values, ALPHA), strict=True)
@@ -210,30 +214,36 @@ def progress_of(scores: pd.DataFrame) -> dict[str, float]:
     return scores.sum().sort_values(ascending=False, kind="stable").to_dict()
 
 
-def verified_ranking(runs: pd.DataFrame) -> Ranking:
+def _pairs(rows: list[str], row: str) -> tuple[np.ndarray, np.ndarray]:
+    """The positions of both rows of each tested pair."""
+    first, second = np.triu_indices(len(rows), 1)
+    tested = [not row or row in (rows[a], rows[b]) for a, b in zip(first, second, strict=True)]
+    return first[tested], second[tested]
+
+
+def verified_ranking(runs: pd.DataFrame, row: str = "") -> Ranking:
     """The ranking, without significant pairs if too many simulated draws of equal rows have one."""
-    ranked = ranking(runs)
+    ranked = ranking(runs, row)
     if not ranked.better:
         return ranked
-    ranked = replace(ranked, level=simulated_level(runs))
+    ranked = replace(ranked, level=simulated_level(runs, row=row))
     return ranked if ranked.decidable else replace(ranked, better=set())
 
 
-def simulated_level(runs: pd.DataFrame, draws: int = 200) -> float:
+def simulated_level(runs: pd.DataFrame, draws: int = 200, row: str = "") -> float:
     """The fraction of draws of scenes with a significant pair, after centring the rows in each set: they are equal."""
     means = runs.groupby(["set", "row"])["progress"].transform("mean")
-    scores = by_scene(runs.assign(progress=runs["progress"] - means)).to_numpy()
-    return _simulated_level(scores.tobytes(), len(scores), draws)
+    scores = by_scene(runs.assign(progress=runs["progress"] - means))
+    first, second = _pairs([*scores.columns], row)
+    differences = scores.to_numpy()[:, first] - scores.to_numpy()[:, second]
+    return _simulated_level(differences.tobytes(), len(scores), draws) if len(first) else 0.0
 
 
 @cache  # several tables show the same ranking
 def _simulated_level(content: bytes, scenes: int, draws: int) -> float:
-    scores = np.frombuffer(content).reshape(scenes, -1)
-    rng, significant, (first, second) = np.random.default_rng(1), 0, np.triu_indices(scores.shape[1], 1)
-    for _ in range(draws if len(first) else 0):
-        drawn = scores[rng.integers(scenes, size=scenes)]
-        significant += flips.any_at_most(drawn[:, first] - drawn[:, second], ALPHA / len(first))
-    return significant / draws
+    differences, rng = np.frombuffer(content).reshape(scenes, -1), np.random.default_rng(1)
+    drawn = (differences[rng.integers(scenes, size=scenes)] for _ in range(draws))
+    return sum(flips.any_at_most(each, ALPHA / differences.shape[1]) for each in drawn) / draws
 
 
 def by_scene(runs: pd.DataFrame) -> pd.DataFrame:
@@ -258,8 +268,9 @@ def bounds(runs: pd.DataFrame) -> tuple[float, float] | None:
 
 
 def seconds_per_unit(everything: pd.DataFrame) -> pd.DataFrame:
-    """Median `seconds` of a unit and number of `timed` runs, by set and row, on the machine with most quiet runs."""
+    """Median `seconds` and number of `timed` runs at 1 unit, by set and row, on the machine with most quiet runs."""
     runs = everything.drop_duplicates([*KEY, "row", "started"])  # a run may be shipped and local
+    runs = runs[runs["budget"] == 1]  # at other budgets, iterations may have other numbers of rays
     runs = runs[runs["timed"] & runs["ok"] & (runs["cost"] > 0)]
     runs = runs[runs["machine"].isin(runs["machine"].mode().iloc[:1])]
     runs = runs.assign(seconds=runs["seconds"] / runs["cost"] * runs["set"].map(suite().units))

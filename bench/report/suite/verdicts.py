@@ -38,6 +38,23 @@ def undecided(ranked: Ranking, when: str) -> str:
     return f"{when}, {plural(ranked.scenes, 'scene')} cannot decide between {rows}."
 
 
+def row_alone(ranked: Ranking, row: str, when: str) -> str:
+    """Which rows differ from a row, by a ranking whose tested pairs are those of the row alone."""
+    if not ranked.decidable:
+        return f"{when}, {plural(ranked.scenes, 'scene')} cannot decide between {row} and others."
+    worse = [other for other in ranked.progress if (row, other) in ranked.better]
+    better = [other for other in ranked.progress if (other, row) in ranked.better]
+    equal = [other for other in ranked.progress if other not in (row, *worse, *better)]
+    texts = {
+        "significantly more progress than": worse,
+        "significantly less than": better,
+        "no significant difference from": equal,
+    }
+    named = "; ".join(f"{text} {', '.join(rows)}" for text, rows in texts.items() if rows)
+    sample = f"{plural(ranked.scenes, 'scene')}, Holm's correction over {ranked.pairs} pairs of this row"
+    return f"{row} {when[0].lower()}{when[1:]}: {named} ({sample})."
+
+
 def short_names(rows: Iterable[str]) -> dict[str, str]:
     """The names of rows without their settings, where that leaves them different."""
     first = {row: row.partition(",")[0] for row in rows}
