@@ -95,6 +95,8 @@ class Judge:
             raise ValueError("--align, --no-icp and --surface are for --tnt: add --tnt FOLDER --scene Barn")
         if self.points < 1:
             raise ValueError(f"--points must be at least 1, found {self.points}")
+        if self.seed < 0:
+            raise ValueError(f"--seed must be at least 0, found {self.seed}")
         if not re.fullmatch(r"[\d.eE+-]+%?", self.threshold) or not float(self.threshold.rstrip("%")) > 0:
             raise ValueError(f"--threshold must be a positive number, such as 0.02 or 1%, not {self.threshold}")
 
@@ -160,6 +162,8 @@ class Judge:
         surface = None if cloud is not None else read_mesh(truth)
         truth_points = surface.used_vertices if surface is not None else cloud
         all_points = truth_points if surface is None else coincidence.samples_of(surface)
+        if not np.ptp(truth_points, axis=0).any():
+            raise BadInput(f"'{truth}': points must differ, found {len(truth_points)} at one place: export it again")
         notes, is_other_frame = _frame_check(mesh, all_points, is_partial=False)
         if self.unit_sphere:
             centre, factor = fit_in_sphere(truth_points, SPHERE_RADIUS)

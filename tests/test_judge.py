@@ -181,7 +181,10 @@ def test_what_is_no_mesh_is_refused_by_its_cause(files, capsys):
         assert name == "points" or words in refused(capsys, truth, "--truth", files / f"{name}.ply")
     assert "is a folder and --truth" in refused(capsys, files / "found", "--truth", truth)
     assert "is a folder, and" in refused(capsys, truth, "--truth", files / "truth")
+    (files / "one.obj").write_text("v 0 0 0\nv 0 0 0\n")
+    assert "must differ, found 2 at one place" in refused(capsys, truth, "--truth", files / "one.obj")
     assert "--points must be at least 1" in refused(capsys, truth, "--truth", truth, "--points", 0)
+    assert "--seed must be at least 0, found -1" in refused(capsys, truth, "--truth", truth, "--seed", -1)
     assert "add --method NAME" in refused(capsys, truth, "--truth", truth, "--into", files / "results")
     for option in (["--unit-sphere"], ["--threshold", "2"]):
         assert "are for --truth: --dtu has mm" in refused(capsys, truth, "--dtu", files, *option)
