@@ -10,6 +10,7 @@ import sys
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 # Waiting OpenMP threads must sleep: if they spin, a second process on the same cores makes both 4 to 20 times slower.
@@ -66,6 +67,20 @@ def _foreign_package_message() -> str:
             )
     return ""
 
+
+def _print_uncaught(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Prints one line after a Ctrl-C that nothing caught, also if a library made another error of it."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, KeyboardInterrupt):
+        cause = cause.__cause__ or cause.__context__
+    if cause is None:
+        sys.__excepthook__(kind, error, trace)
+    else:
+        print("error: stopped by Ctrl-C", file=sys.stderr)
+
+
+if sys.argv[:1] == ["-m"]:  # `python -m bench.NAME`, or another module that imports this one at once
+    sys.excepthook = _print_uncaught
 
 if foreign_package := _foreign_package_message():
     if sys.argv[:1] == ["-m"]:  # `python -m bench` is still looking for the command

@@ -37,4 +37,5 @@ if __name__ == "__main__":
     try:
         sys.exit(main())
     except KeyboardInterrupt:  # before the command line was read
-        sys.exit("error: stopped by Ctrl-C; nothing was run")
+        print("error: stopped by Ctrl-C; nothing was run", file=sys.stderr)
+        sys.exit(130)  # as after the command line was read

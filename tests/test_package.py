@@ -112,6 +112,16 @@ def test_a_package_that_was_installed_over_ours_is_an_error(tmp_path):
     assert code == 1 and "ImportError" in err and "not the package conf of implicit-bench" in err
 
 
+@pytest.mark.parametrize("act", ["raise KeyboardInterrupt", "try: raise KeyboardInterrupt\nfinally: print(unknown)"])
+def test_ctrl_c_while_a_command_is_imported_is_one_line(tmp_path, act):
+    (tmp_path / "numpy.py").write_text(act)
+    (tmp_path / "hydra.py").write_text("raise KeyboardInterrupt")
+    assert started(tmp_path, "-m", "bench.judge", "--help")[1] == "error: stopped by Ctrl-C\n"
+    assert started(tmp_path, "-m", "bench") == (130, "error: stopped by Ctrl-C; nothing was run\n")
+    _, err = started(tmp_path, "-c", "import bench; raise KeyboardInterrupt")
+    assert "Traceback" in err  # a user's program keeps its own
+
+
 def test_a_users_conf_module_does_no_harm(tmp_path):
     (tmp_path / "conf.py").write_text("project = 'documentation'")
     assert started(tmp_path, "-c", "import bench") == (0, "")
