@@ -66,10 +66,6 @@ def command_line(work: Work, sweep: Sweep | None = None) -> int:
         all_ok = _compose_and_run(sys.argv[1:], work, sweep)
         raise_if_stopped()  # a library may have swallowed the exception
         return 0 if all_ok else EXIT_FAILURE
-    except (HydraException, OmegaConfBaseException, ValueError) as error:  # one of Hydra's is also an OSError
-        text = message_of(error)
-        text = extension("typed_field_keys")(text) if "field=file" in sys.argv else text
-        return _print_error(_add_file(text), EXIT_USAGE)
     except BrokenPipeError:  # `| head` reads only a part
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return EXIT_FAILURE
@@ -77,6 +73,10 @@ def command_line(work: Work, sweep: Sweep | None = None) -> int:
         if stopped := stopped_by(error):  # also if a library turned the signal into another error
             text = stopped if isinstance(error, Interrupted) else f"{stopped}; nothing was run"
             return _print_error(text, EXIT_INTERRUPTED)
+        if isinstance(error, HydraException | OmegaConfBaseException | ValueError):  # one of Hydra's is also an OSError
+            text = message_of(error)
+            text = extension("typed_field_keys")(text) if "field=file" in sys.argv else text
+            return _print_error(_add_file(text), EXIT_USAGE)
         if isinstance(error, OSError | LauncherStopped):
             return _print_error(write_error_message(error) if isinstance(error, OSError) else str(error))
         raise

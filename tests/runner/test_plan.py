@@ -1,6 +1,8 @@
 """A plan is checked before anything runs; plan=true lists it, and writes nothing."""
 
 import gzip
+import signal
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -162,6 +164,18 @@ def test_a_sweep_that_is_stopped_during_planning_says_that_nothing_was_run(resul
     result = command(*SWEEP, f"results_dir={results}")
     assert result.code == 130 and result.err.endswith("error: stopped by Ctrl-C; nothing was run\n")
     assert not results.exists()
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_an_error_that_a_library_makes_of_ctrl_c_has_the_name_of_ctrl_c(results, monkeypatch):
+    def stopped(*_, **__):
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        raise ValueError("unknown key 'ranges.seat_height'")
+
+    monkeypatch.setattr(sweep, "check_plan", stopped)
+    result = command(*SWEEP, f"results_dir={results}")
+    assert result.code == 130 and result.err.endswith("error: stopped by Ctrl-C; nothing was run\n")
 
 
 def test_a_single_run_is_planned_too(results):
