@@ -75,7 +75,8 @@ class OptimiserSettings:
         check_at_least("task.optimiser.afforded_iterations", self.afforded_iterations, 1, "the suite has 40")
         if self.ends == HELD_OUT and self.schedule != "constant":
             raise ValueError(
-                "effort=needed (ends=held_out) is for task=completion and task.optimiser.schedule=constant"
+                "effort=needed (ends=held_out) is only for task=completion with task.optimiser.schedule=constant: "
+                "set effort=full"
             )
         if self.ends == BUDGET and self.budget is None:
             raise ValueError("task.optimiser.ends=budget needs task.optimiser.budget=COST, such as 4e6")

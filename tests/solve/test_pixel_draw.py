@@ -146,3 +146,8 @@ def test_a_completion_with_no_more_effort_than_needed(isolated):
 def test_effort_is_refused_where_nothing_is_held_out(isolated, changes):
     code, _, err = isolated(*SMOKE, *changes, "effort=needed", "task.optimiser.schedule=constant")
     assert code == 2 and "effort=needed is only for task=completion with field=prior: set effort=full" in err
+
+
+def test_a_schedule_that_needs_all_iterations_is_refused_with_the_remedy(isolated):
+    code, _, err = isolated(*SMOKE, "task=pose", "effort=needed")
+    assert code == 2 and "with task.optimiser.schedule=constant: set effort=full" in err
