@@ -37,7 +37,7 @@ RATIO = (
     "A ratio is the median over shapes of the ratio of the two rows' geometric mean errors. After it stands the number "
     "of shapes on which the row is better; a tie counts as half."
 )
-HOLM = "By the sign test over shapes with Holm's correction"
+HOLM = "the sign test over shapes with Holm's correction"
 METRIC, LABEL = "chamfer_l2", "Chamfer × 1000\n(scene units²)"
 CONDITION_KEY = "task.points"  # tables have a column for each of its values
 CONDITION_ORDER = ("dense", "50%", "10%", "100", "50", "20")
@@ -45,8 +45,8 @@ PRIORS = Selection("priors")
 ORACLE = "oracle: the prior's fit to the truth"
 FITTED = "The oracle is a latent code fitted to the distances of the true mesh (`+experiment=priors`), for all shapes."
 PLOTTED = (
-    "Median error under each condition; median over shapes of their geometric means, with its ratio; median cost of "
-    "runs that ended ok."
+    "Median error under each condition; median over shapes of a shape's geometric mean error, with its ratio; median "
+    "cost of runs that ended ok."
 )
 Line = dict[str, Any]
 Above = dict[str, dict[str, Any]]  # medians of further lines, by name and family
@@ -261,7 +261,7 @@ class Compared:
         return [line for line in self.pooled if not line["lacking"] and Row(line["preset"], line["row"]) in usual_rows]
 
     def differing(self, versus: str) -> str:
-        """The verdict on the ratios of all rows to their references, see `differing`."""
+        """The verdict on the error ratios of all rows to their references, see `differing`."""
         return differing([(line["row"], ratio_of(line["ratio"])) for line in self.comparable], versus)
 
     def best(self, least_of: str) -> str:
@@ -347,30 +347,34 @@ class Comparison:
 
 
 def differing(ratios: Sequence[tuple[str, Interval | None]], versus: str) -> str:
-    """The verdict on a family of named ratios, see `statistics.ratio_verdicts`; empty if none has an interval."""
+    """The verdict on named ratios of errors, see `statistics.ratio_verdicts`; empty if none has an interval.
+
+    Args:
+        versus: completes "error ratios", such as "to DIST"; may be empty.
+    """
     tested = [(name, ratio) for name, ratio in ratios if ratio is not None and ratio.has_ends]
+    what = f"error ratios {versus}".strip()
     if not tested:
         return ""
     verdicts = statistics.ratio_verdicts([ratio for _, ratio in tested])
-    undecided, undistinguished = (verdicts.count(kind) for kind in (Verdict.NOT_DECIDABLE, Verdict.NOT_DISTINGUISHED))
+    undecided = verdicts.count(Verdict.NOT_DECIDABLE)
     sizes = sorted({len(ratio.points) for _, ratio in tested})
     if undecided == len(tested):
         few = f"cannot be decided with {' or '.join(map(str, sizes))} shapes"
         needed = f"{format.plural(undecided, 'ratio')} need {statistics.shapes_needed(undecided)} shapes or more"
-        return f"Whether ratios {versus} differ from 1 *{few}*: by the sign test with Holm's correction {needed}."
+        return f"Whether {what} differ from 1 *{few}*: by the sign test with Holm's correction {needed}."
     unequal = [
         f"{name} {ratio}" for (name, ratio), verdict in zip(tested, verdicts, strict=True) if verdict is Verdict.DIFFERS
     ]
-    differ = f"*{len(unequal)} of {len(tested)}* ratios {versus} differ significantly from 1"
+    needed = f"{statistics.shapes_agreeing(sizes[-1], len(tested))} of {sizes[-1]} shapes on one side of 1"
+    if not unequal and len(tested) == 1:
+        name, ratio = tested[0]
+        answer = f"{name}: the {what.replace('ratios', 'ratio', 1)} is *{ratio}*, not significantly different from 1."
+        return f"{answer} The sign test needs {needed}."
+    differ = f"*{len(unequal)} of {len(tested)}* {what} differ significantly from 1 by {HOLM}"
     differ += f"{': ' if unequal else ''}{'; '.join(unequal)}."
-    parts = [
-        f"{undistinguished} cannot be distinguished from 1" if undistinguished else "",
-        f"{undecided} cannot be decided with {sizes[0]} shapes" if undecided else "",
-    ]
-    agreeing = f"{statistics.shapes_agreeing(sizes[-1], len(tested))} of {sizes[-1]} shapes"
-    step = "" if unequal else f" The test needs {agreeing} on one side of 1."
-    others = "; ".join(filter(None, parts))
-    return f"{differ} {HOLM}{f', {others}' if others else ''}.{step}"
+    few = f" {undecided} cannot be decided with {sizes[0]} shapes." if undecided else ""
+    return f"{differ}{few}{'' if unequal else f' The test needs {needed}.'}"
 
 
 def ordered(conditions: Collection[str]) -> list[str]:

@@ -27,11 +27,11 @@ NOTES = (
     "default epsilon. They are medians over shapes; a failed run has the largest error of all rows on its shape.",
     "A row at full effort has no ratios. An error ratio below 1 is better; after it stands the number of shapes on "
     "which the row is better. An interval that contains 1 does not show that errors are equal.",
-    "`effort=needed` holds out a tenth of the pixels. Each iteration compares a random pixel of blocks of 4 x 4 "
-    "pixels, then of 2 x 2, then all others: the next when the loss of the held-out pixels stops falling. The last ten "
-    "iterations compare all pixels. The true shape is not used. DIST and IDR have an epsilon of half a pixel, "
-    "Newton has none.",
-    "Two rows test each part alone: `epsilon=auto`, and `effort=needed` with the default epsilon.",
+    "`effort=needed` holds out a tenth of the pixels. An iteration compares a random pixel of each block: of 4 x 4 "
+    "pixels at first, then of 2 x 2, then every pixel. Blocks become smaller when the loss of the held-out pixels "
+    "stops falling. The last ten iterations compare all pixels, held-out ones included. The true shape is not used. "
+    "DIST and IDR have an epsilon of half a pixel, Newton has none.",
+    "Two rows of DIST test one part alone: `epsilon=auto`, and `effort=needed` with the default epsilon.",
     "Field evaluations: a gradient counts as two. Those of the held-out pixels are included. Runs that did not end ok "
     "have no cost.",
 )
@@ -92,7 +92,7 @@ def _verdict(pooled: list[Line]) -> str:
         parts = [_costs(line) for line in pooled if line["preset"] in presets and line["ratio"]]
         sentences += [f"{beginning}: {', '.join(parts)}."] if parts else []
     ratios = [(line["row"], compare.ratio_of(line["ratio"])) for line in pooled]
-    return " ".join(filter(None, [*sentences, compare.differing(ratios, "of errors")]))
+    return " ".join(filter(None, [*sentences, compare.differing(ratios, "")]))
 
 
 def _costs(line: Line) -> str:

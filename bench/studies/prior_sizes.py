@@ -18,7 +18,8 @@ NOTES = (
     "largest error of all rows on its shape. A row without a run that ended ok has no ratio.",
     "After a ratio stands the number of shapes on which the row is better. An interval that contains 1 does not show "
     "that errors are equal.",
-    "FLOPs are those of all field evaluations of a run. The network has the weights; each shape has a code.",
+    "FLOPs are those of all field evaluations of a run. All shapes share the weights of the network, and each shape "
+    "has a code.",
 )
 Line = dict[str, Any]
 
@@ -90,13 +91,13 @@ def _verdict(lines: list[Line]) -> str:
     similar = [line for (line, _), larger in zip(tested, is_larger, strict=True) if not larger]
     candidates = [line for line in (*similar, largest) if line["flops"]]  # with a run that ended ok
     if not tested or statistics.Verdict.NOT_DECIDABLE in verdicts or largest not in candidates:
-        return compare.differing(ratios, f"of errors, to {largest['row']},")
-    text = f"{compare.HOLM}, *{sum(is_larger)} of {len(tested)}* priors have a larger error."
+        return compare.differing(ratios, f"to {largest['row']}")
+    text = f"By {compare.HOLM}, *{sum(is_larger)} of {len(tested)}* smaller priors have a larger error."
     smallest = min(candidates, key=lambda line: line["weights"])
     if smallest is largest:
         return f"No smaller prior is as good as *{largest['row']}* (layers × width). {text}"
-    limit = f"without a significantly larger error than {largest['row']}"
-    return f"The smallest prior {limit} is *{smallest['row']}* (layers × width). {text}"
+    limit = f"whose error is not significantly larger than that of {largest['row']}"
+    return f"*{smallest['row']}* (layers × width) is the smallest prior {limit}. {text}"
 
 
 def _panels(pooled: list[Line]) -> list[chart.Panel]:
@@ -112,7 +113,7 @@ def _panels(pooled: list[Line]) -> list[chart.Panel]:
             texts = [f"{line['weights']:,} weights" for line in lines]
             name = f"network {network}{f', {preset}' if several else ''}"
             curves.append(chart.curve(name, "", x, y, text=texts) | {"colour": colour, "symbol": "o"})
-        panels.append(chart.panel_data("", "numbers of the code", title, curves, ticks=[*map(str, codes)]))
+        panels.append(chart.panel_data("", "length of the code (numbers)", title, curves, ticks=[*map(str, codes)]))
     return panels
 
 

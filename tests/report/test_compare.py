@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.records.read import read_records
-from bench.report.compare import ALL_FAMILIES, HOLM, Compared, Comparison, differing, ordered
+from bench.report.compare import ALL_FAMILIES, Compared, Comparison, differing, ordered
 from bench.report.data import statistics
 from bench.report.data.runs import Runs, Selection, choose
 from bench.report.write.result import Result
@@ -82,7 +82,7 @@ def test_a_line_has_errors_ratio_and_cost(whole):
     assert own["error"] == pytest.approx(0.5 * 12 ** (1 / 2) * 2 * 9)  # of shapes 1 to 6, points 1 and 4
     assert own["100"] == pytest.approx(0.5 * 3.5 * 9) and own["20"] == pytest.approx(0.5 * 3.5 * 9 * 4)
     assert line(result, "dist with mask")["ratio"] == ""
-    assert "*3 of 3* ratios to DIST differ significantly from 1: newton with mask 0.500 [0.500," in result.verdict
+    assert "*3 of 3* error ratios to DIST differ significantly from 1 by the sign test" in result.verdict
 
 
 def test_a_failure_counts_as_the_worst_error_of_its_shape(tmp_path):
@@ -99,7 +99,7 @@ def test_conditions_stand_from_many_points_to_few():
 
 def test_without_the_reference_there_is_no_ratio_and_no_verdict(whole):
     result = kept(whole, lambda record: record["renderer"] != "dist")
-    assert set(result.data["ratio"]) == {""} and "ratios to" not in result.verdict
+    assert set(result.data["ratio"]) == {""} and "error ratios" not in result.verdict
 
 
 def test_where_nothing_ended_well_there_is_no_verdict(tmp_path):
@@ -164,14 +164,20 @@ def test_rows_of_other_families_with_other_evaluations_are_told(tmp_path):
 def test_a_verdict_counts_the_ratios_that_differ_from_1():
     ratios = {name: of_eight([one, other]) for name, one, other in (("worse", 2.0, 2.0), ("mixed", 1.5, 0.7))}
     said = differing([*ratios.items()], "to DIST")
-    assert said.startswith("*1 of 2* ratios to DIST differ significantly from 1: worse 2.00")
-    assert said.endswith(f"{HOLM}, 1 cannot be distinguished from 1.")
+    assert said.startswith("*1 of 2* error ratios to DIST differ significantly from 1 by the sign test")
+    assert "worse 2.00" in said and "mixed" not in said
 
 
 def test_a_ratio_with_seven_of_eight_shapes_is_no_difference():
     seven = statistics.ratio([np.array([0.5])] * 7 + [np.array([2.0])], [np.ones(1)] * 8)
     said = differing([("one", seven), ("other", seven)], "to DIST")
-    assert said.startswith(f"*0 of 2* ratios to DIST differ significantly from 1. {HOLM}, 2 cannot be")
+    assert said.startswith("*0 of 2* error ratios to DIST differ significantly from 1")
+    assert said.endswith("The test needs 8 of 8 shapes on one side of 1.")
+
+
+def test_a_verdict_on_one_ratio_that_is_not_significant_has_its_value():
+    said = differing([("one", of_eight([1.5, 0.7]))], "")
+    assert said.startswith("one: the error ratio is *1.0") and "not significantly different from 1" in said
 
 
 def test_a_verdict_that_no_data_could_give_is_none():

@@ -30,10 +30,10 @@ def line(row: str, errors: list[float], weights: int) -> dict:
 
 
 @each("small, middle, answer, count", [
-    (WORSE, ALIKE, "larger error than large is *middle*", "*1 of 2* priors have a larger error."),
-    (ALIKE, ALIKE, "larger error than large is *small*", "*0 of 2* priors have a larger error."),
-    (BETTER, ALIKE, "larger error than large is *small*", "*0 of 2* priors have a larger error."),
-    (WORSE, WORSE, "No smaller prior is as good as *large*", "*2 of 2* priors have a larger error."),
+    (WORSE, ALIKE, "*middle* (layers × width) is the smallest prior", "*1 of 2* smaller priors have a larger error."),
+    (ALIKE, ALIKE, "*small* (layers × width) is the smallest prior", "*0 of 2* smaller priors have a larger error."),
+    (BETTER, ALIKE, "*small* (layers × width) is the smallest prior", "*0 of 2* smaller priors have a larger error."),
+    (WORSE, WORSE, "No smaller prior is as good as *large*", "*2 of 2* smaller priors have a larger error."),
 ])  # fmt: skip
 def test_the_verdict_names_the_smallest_prior_without_a_larger_error(small, middle, answer, count):
     largest = {"row": "large", "flops": 1.0, "weights": 100, "ratio": None}
