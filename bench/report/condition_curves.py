@@ -17,8 +17,8 @@ from bench.report.write.table import Column, ends, text
 SHAPE = ["family", "solid", "seed"]
 NOTE = (
     "Values are medians over shapes. The figure and the CSV have intervals of the sign test. A ratio is the median of "
-    "the ratios on the same shapes, not the ratio of medians. The verdict's significance is by the sign test with "
-    "Holm's correction over all its ratios."
+    "the ratios on the same shapes, not the ratio of medians. The answer calls a ratio significant by the sign test "
+    "with Holm's correction over all its ratios."
 )
 Line = dict[str, Any]
 
@@ -48,6 +48,7 @@ class ConditionCurves:
     notes: Callable[[Runs], list[str]]
     absent: float = 0.0  # the value of the condition in runs without the key
     reference: str = ""  # preset of the row that the verdict compares with at `compared`; empty: each row at `first`
+    leading: str = ""  # begins a sentence on the medians of the first measure at the ends of the condition; empty: none
     only_in_table: tuple[str, ...] = ()  # presets that the figure leaves out, and the verdict without a `reference`
 
     def __call__(self, runs: Runs) -> Result:
@@ -64,7 +65,7 @@ class ConditionCurves:
             self.title,
             f"{self.measures[0].heading}, over {self.heading.lower()}.",
             question=self.question,
-            verdict=self._verdict(compared),
+            verdict=" ".join(filter(None, [self._medians(lines), self._verdict(compared)])),
             interval="95 % intervals over shapes (of the sign test)",
             estimates=[line["estimates"][self.measures[0].key] for line in lines],
             remarks=[*self.notes(runs), NOTE],
@@ -135,11 +136,25 @@ class ConditionCurves:
             undecided = statistics.Verdict.NOT_DECIDABLE in verdicts.values()
             reason = "undecided: too few shapes" if undecided else "not significantly different from 1"
             if differ:
-                parts.append(f"{format.plural(len(ratios) - len(differ), 'other row')} {reason}")
+                others = len(ratios) - len(differ)
+                parts.append(f"{format.plural(others, 'other ratio')} {'is' if others == 1 else 'are'} {reason}")
             else:
                 parts = [f"*{format.number(ratio.value)}* ({name}), {reason}" for name, ratio in ratios.items()]
         shapes = sorted({len(ratio.points) for ratio in ratios.values()})
         return f"{self.verdict}: {'; '.join(parts)}; n = {' or '.join(map(str, shapes))} shapes."
+
+    def _medians(self, lines: list[Line]) -> str:
+        """The rows with the least and the largest median at the smallest and at the largest value; empty if unwanted."""
+        key, values = self.measures[0].key, [line["value"] for line in lines]
+        if not self.leading or not values:
+            return ""
+        texts = []
+        for value in sorted({min(values), max(values)}):
+            shown = [line for line in lines if line["value"] == value and line["preset"] not in self.only_in_table]
+            least, *_, most = sorted([*shown, *shown], key=lambda line: line[key])
+            ends = [f"*{format.number(line[key])}* ({line['name']})" for line in (least, most)]
+            texts.append(f"{' to '.join(ends)} at {value:g}")
+        return f"{self.leading}: {', and '.join(texts)} {self.heading.lower()}."
 
     def _panel(self, lines: list[Line], measure: Measure) -> chart.Panel:
         rows: dict[tuple[str, str], list[Line]] = {}

@@ -19,11 +19,12 @@ NOTES = (
     "pixels per side: the smallest block with which the budget pays for 40 iterations. With several rays, blocks "
     "are larger, so an iteration compares fewer pixels, and a run may have more iterations.",
     "With 1 ray, the observation of a pixel is its mask at the centre. With 4 and 16, it is the fraction that the "
-    "shape covers. So a ratio also contains the change of the observation. Rows with mask or fraction in their name "
-    "keep that observation for any number of rays. With fraction, a single ray goes through a random point.",
-    "Rows with area in their name compare a pixel's mean opacity with the fraction of it that the shape covers. The "
-    "other rows, also of volume renderers, have DIST's mask loss. Of n rays in a pixel of which the shape covers a "
-    "fraction k, k n should hit. The figure and the verdict leave them out.",
+    "shape covers. So a ratio also contains the change of the observation. Rows with “mask” or “fraction” after “area” "
+    "in their name keep that observation for any number of rays. With “fraction”, a single ray goes through a random "
+    "point.",
+    "Rows with “area” in their name compare a pixel's mean opacity with the fraction of it that the shape covers. The "
+    "other rows, also of volume renderers, have DIST's mask loss: if the shape covers a fraction k of a pixel, k n of "
+    "its n rays should hit. The figure and the answer have only “area” rows without “mask” or “fraction”.",
     "The weights of the two losses were chosen on four validation shapes, for the relaxed boundary and NeuS: of 1, 10, "
     "100 and 1000 for areas with 4 rays, and of 1, 10 and 100 for masks with 1 ray.",
     "A run that is not ok counts with its result, if it has one. With `not_reached`, its loss did not fall.",
@@ -54,7 +55,7 @@ PAGES = {
         first=1,
         absent=1,
         compared=4,
-        measures=(condition_curves.Measure("chamfer_l1", "Chamfer-L1 × 1000", 1e3),),
+        measures=(condition_curves.Measure("chamfer_l1", "Chamfer-L1 × 1000 (scene units)", 1e3),),
         title="Many views by rays per pixel.",
         question="At equal cost, do several rays per pixel lower the error of a shape from many views?",
         verdict="Chamfer-L1 with 4 rays per pixel over that with 1, at equal cost",

@@ -11,19 +11,20 @@ RAYS = "view.rays_per_pixel"
 READS = (Selection("outline", (RAYS,), setup=Selection.WITHOUT_MACHINE),)
 CONTROLS = tuple(f"outline_{name}_{kept}" for name in ("relaxed", "neus") for kept in ("mask", "fraction"))
 NOTES = (
-    "A prior's code is fitted to the mask of one image of 24 x 24 pixels, without depth. The code is penalised little.",
+    "A prior's code is fitted to the mask of one image of 24 x 24 pixels, without depth. The penalty of the code has a small weight.",
     "The area error sums the differences between the fractions of pixels that the fitted and the true mesh cover, each "
     "by 8 x 8 rays. At the start, the mean shape has an error of {start:.3g} pixels (median over shapes).",
-    "Rows with area in their name compare a pixel's mean opacity with the fraction that the shape covers. The others "
-    "compare single rays: in a pixel of which a fraction k of n rays is covered, k rays should hit. Rays that hit come "
-    "first, in random order, and then the rays nearest to the surface.",
-    "With 1 ray, it goes through the centre of each pixel. With 4 and 16, each iteration draws a random ray in each of "
-    "2 x 2 or 4 x 4 squares of the pixel. Edge sampling splits these squares, as it splits pixels with 1 ray. All rows "
+    "Rows with “area” in their name compare a pixel's mean opacity with the fraction that the shape covers. The others "
+    "compare single rays: if the shape covers a fraction k of a pixel, k n of its n rays should hit. Rays that hit are "
+    "chosen first, in random order, and then the rays nearest to the surface.",
+    "A single ray goes through the centre of the pixel. With 4 and 16 rays, each iteration draws a random ray in each "
+    "of 2 x 2 or 4 x 4 squares of the pixel. Edge sampling splits these squares, as it splits pixels with 1 ray. All rows "
     "have 60 iterations, whatever their rays cost.",
-    "Rows may have fewer shapes with 16 rays. Compare their ratios then, not their medians.",
+    "Rows may have fewer shapes with 16 rays than with 1. Compare their ratios, not their medians.",
     "A run that is not ok counts with its result, if it has one. With `not_reached`, its loss did not fall.",
     "With 1 ray, a pixel's observation is its mask at the centre. With several, it is the covered fraction. Rows with "
-    "mask or fraction in their name keep that observation for any number of rays. The figure leaves them out.",
+    "“mask” or “fraction” at the end of their name keep that observation for any number of rays. The figure leaves "
+    "them out.",
 )
 
 
@@ -57,7 +58,7 @@ PAGE = condition_curves.ConditionCurves(
     compared=4,
     measures=(
         condition_curves.Measure("area_error", "Area error (pixels)"),
-        condition_curves.Measure("chamfer_l1", "Chamfer-L1 × 1000", 1e3),
+        condition_curves.Measure("chamfer_l1", "Chamfer-L1 × 1000 (scene units)", 1e3),
     ),
     title="Outlines by several rays per pixel.",
     question="Does a silhouette loss fit an outline better with several rays per pixel?",

@@ -51,7 +51,7 @@ def test_a_row_is_compared_with_itself_at_the_first_value(monkeypatch):
     assert by_cell["A", 4]["ratio"] == pytest.approx(0.5) and by_cell["A", 1]["ratio"] is None
     assert by_cell["A", 1]["error"] == pytest.approx(10 * 2.0 * 4.5, rel=0.1)
     verdict = page()._verdict(page()._over_first(lines))
-    assert "*0.500* (A)" in verdict and "1 other row not significantly different" in verdict
+    assert "*0.500* (A)" in verdict and "1 other ratio is not significantly different" in verdict
     assert "n = 8 shapes" in verdict
 
 
