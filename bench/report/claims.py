@@ -29,11 +29,11 @@ COLUMNS = (
 )
 RULES = (
     "A ratio compares the errors of two rows, or their field evaluations. It is a median over shapes without those "
-    "where both rows failed. The 95 % interval of the sign test needs six shapes. The published ratio is of the "
-    "paper's numbers, as a geometric mean over families.",
-    "A claim of a smaller error “holds” if the interval is below 1, and “does not hold” if it is above 1. If the "
-    "interval shows less than half of the published effect, on a log scale, the verdict is “weaker” if it is below 1, "
-    "and “less than half the effect” if it contains 1.",
+    "where both rows failed. The 95 % interval of the sign test needs six shapes. The published ratio is the ratio of "
+    "the paper's numbers, as a geometric mean over families.",
+    "A claim of a smaller error “holds” if the interval is below 1, and “does not hold” if it is above 1. An interval "
+    "may show less than half of the published effect on a log scale. Then the verdict is “weaker” if the interval is "
+    "below 1, and “less than half the effect” if it contains 1.",
     f"A claim of no larger error allows ratios up to {MAX_SAME_RATIO}. This margin is ours. The claim “holds” if the "
     "interval is below it. “Larger (size not decided)”: the interval is above 1 and contains the margin.",
     "With fewer than six shapes, the verdict only states whether the median is as claimed. All other cases are “not "
@@ -86,11 +86,14 @@ def _verdict(verdicts: list[str]) -> str:
     tested = {kind: kinds.count(kind) for kind in dict.fromkeys(kinds) if kind not in (CHECKED, UNTESTED)}
     holds, few = tested.pop("holds", 0), tested.pop(AS_CLAIMED, 0)
     on_few = f"; {few} are as claimed on few shapes, without a test" if few else ""
-    measured = f"*{holds}* of {holds + few + sum(tested.values())} measured comparisons hold{on_few}."
-    others = f"Others: {'; '.join(f'{kind} {count}' for kind, count in tested.items()) or 'none'}."
+    verb = "holds" if holds == 1 else "hold"
+    measured = f"*{holds}* of {holds + few + sum(tested.values())} measured comparisons {verb}{on_few}."
+    others = f"Verdicts of the others: {', '.join(f'“{kind}” {count}' for kind, count in tested.items())}."
+    others = others if tested else ""
     checked = format.plural(kinds.count(CHECKED), "claim")
-    rest = f"Tests of this project check {checked}. Not tested: {kinds.count(UNTESTED)}."
-    return f"{measured} {others} {rest}"
+    untested = kinds.count(UNTESTED)
+    rest = f"Tests of this project check {checked}, and {untested} {'is' if untested == 1 else 'are'} not tested."
+    return " ".join(filter(None, [measured, others, rest]))
 
 
 def _line(claim: Claim, runs: Runs | None) -> dict[str, Any]:

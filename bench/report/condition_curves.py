@@ -144,15 +144,14 @@ class ConditionCurves:
         return f"{self.verdict}: {'; '.join(parts)}; n = {' or '.join(map(str, shapes))} shapes."
 
     def _medians(self, lines: list[Line]) -> str:
-        """The rows with the least and the largest median at the smallest and at the largest value; empty if unwanted."""
-        key, values = self.measures[0].key, [line["value"] for line in lines]
-        if not self.leading or not values:
+        """The least and the largest median at both ends of the condition, with their rows; empty if unwanted."""
+        shown = [line for line in lines if line["preset"] not in self.only_in_table] if self.leading else []
+        if not shown:
             return ""
-        texts = []
+        key, values, texts = self.measures[0].key, [line["value"] for line in shown], list[str]()
         for value in sorted({min(values), max(values)}):
-            shown = [line for line in lines if line["value"] == value and line["preset"] not in self.only_in_table]
-            least, *_, most = sorted([*shown, *shown], key=lambda line: line[key])
-            ends = [f"*{format.number(line[key])}* ({line['name']})" for line in (least, most)]
+            at_value = sorted((line for line in shown if line["value"] == value), key=lambda line: line[key])
+            ends = [f"*{format.number(line[key])}* ({line['name']})" for line in (at_value[0], at_value[-1])]
             texts.append(f"{' to '.join(ends)} at {value:g}")
         return f"{self.leading}: {', and '.join(texts)} {self.heading.lower()}."
 

@@ -15,11 +15,12 @@ CONDITIONS = (
 KEYS = tuple(f"task.{condition.key}" for condition in CONDITIONS)
 READS = (Selection("fig10", KEYS, setup=Selection.WITHOUT_MACHINE, may_differ=("prior.truncation",)),)
 NOTES = (
-    "One condition varies, and the other is at 1. The noise is in standard deviations of the prior's training codes. "
+    "One condition varies, and the other is at 1. The noise is in standard deviations σ of the prior's training codes. "
     "At 0, a run starts from the mean shape or, with an encoder, from the encoder's code.",
     "Mesh rows have gradients through the vertices of the prior's mesh, like PMO, the paper's other curve.",
     "A failed run counts as infinite and is drawn at the upper edge.",
-    "The paper (Fig. 10, a chart without numbers) reports that its method is robust to both.",
+    "The paper (Fig. 10, a chart without numbers) reports that its method is robust to other focal lengths "
+    "and initial codes.",
 )
 
 

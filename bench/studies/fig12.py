@@ -19,12 +19,14 @@ KEYS = (*(f"task.{condition.key}" for condition in CONDITIONS), "task.similarity
 READS = (Selection("fig12", KEYS, setup=Selection.WITHOUT_MACHINE, may_differ=("prior.truncation",)),)
 MAX_ERROR = 1.0  # squared scene units x 1000: about the errors of DIST, Table 3; a success has less
 NOTES = (
-    f"A success ended ok with an error below {MAX_ERROR:g}. Its interval is over shapes (Clopper and Pearson).",
+    f"A success is a run that ended ok with an error (Chamfer × 1000) below {MAX_ERROR:g}. The interval "
+    "of the success rate is over shapes (Clopper and Pearson).",
     "One condition varies, and the others are neutral. The direction of a shift, the axis of a rotation and the "
     "initial code are random, and the same for all methods.",
-    "A run also optimises a similarity transform (position, rotation and size), even at zero displacement. Only “place "
-    "known” does not; it is not in the figure. A failed run counts as infinite and is drawn at the upper edge.",
-    "“DIST, paper's” has 72 photographs and 180 iterations. At desk, the other methods have 24 and 60.",
+    "A run also optimises a similarity transform (position, rotation and size), even at zero displacement. Only runs "
+    "of “place known” do not. They are not in the figure.",
+    "A failed run counts as infinite and is drawn at the upper edge.",
+    "“DIST, paper's” has 72 photographs and 180 iterations. At scale=desk, the other methods have 24 and 60.",
     "The paper (Fig. 12) shows pictures of real chairs and no numbers. Here shapes and photographs are synthetic.",
 )
 RUNS = conditions.run_columns(CONDITIONS, "similarity")
@@ -75,7 +77,7 @@ def draw(lines: Sequence[dict[str, Any]]) -> Figure:
             for row, row_lines in grouped(shown, lambda line: (line["method"], line["preset"])).items()
         ]
         if curves:
-            curves.append(chart.level("success: below", [line["value"] for line in shown], MAX_ERROR))
+            curves.append(chart.level("a success is below", [line["value"] for line in shown], MAX_ERROR))
         panels.append(chart.panel_data(name, condition.label, conditions.LABEL, curves))
     return chart.draw(panels, 2.1 * len(lines_by_family) + 0.5, len(lines_by_family), legend=3, sharey="row")
 
@@ -100,14 +102,14 @@ def _verdict(runs: Runs) -> str:
         elif not is_place_known(record):
             undisplaced.append(record)
     ends = table.extremes(
-        f"Misplaced runs that end with an error below {MAX_ERROR:g}",
+        f"Misplaced runs that end with an error (Chamfer × 1000) below {MAX_ERROR:g}",
         _shares(misplaced),
         conditions.shapes_text(misplaced),
         show=table.percent,
         largest_first=True,
     )
     others = " to ".join(sorted({*map(table.percent, _shares(undisplaced).values())}))
-    return f"{ends} Of runs that start at the true place and optimise it too: {others}." if others else ends
+    return f"{ends} Of runs that start at the true place, and also optimise it: {others}." if others else ends
 
 
 def _shares(chosen: list[Record]) -> dict[str, float]:

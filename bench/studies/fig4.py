@@ -26,7 +26,7 @@ def make(runs: Runs) -> Result:
         "Errors of each strategy in the image.",
         "Above, normals (right, up, towards the camera as red, green, blue); below, their angle to the normals of the "
         "reference.",
-        question="Which pixels does each strategy get wrong?",
+        question="How many pixels does each strategy get wrong, and which?",
         verdict=table.extremes("Missed and spurious pixels", wrong, "one shape", show=table.integer),
         remarks=(*comparison.missing, *NOTES),
         data=data,

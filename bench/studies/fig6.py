@@ -18,7 +18,7 @@ NOTES = (
     "An interval counts the views of one shape as one trial. A failed run has not found the pose.",
     "Costs include the trials of all starts, and are medians over runs that ended ok. Iterative closest points (ICP) "
     "run every start to its end.",
-    "The figure has no intervals, the table has them.",
+    "The table has the intervals, and the figure has none.",
 )
 RUNS = (
     table.FAMILY,
@@ -45,7 +45,7 @@ def make(runs: Runs) -> Result:
         runs,
         "Camera pose from a depth image and a silhouette of a known shape.",
         CAPTION.format(**settings),
-        question="How wrong can the initial camera be, if the shape is known?",
+        question="How often is a camera found from a wrong initial camera, if the shape is known?",
         verdict=_verdict(poses),
         interval="95 % intervals over shapes (Clopper and Pearson)",
         estimates=[_rate(row_poses) for _, row_poses in poses.groupby(["row", "preset", "degrees"])],

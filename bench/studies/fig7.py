@@ -46,8 +46,8 @@ def _verdict(counts: list[dict[str, Any]]) -> str:
     similar = [f"{epsilon:g}" for epsilon, pixels in wrong.items() if pixels - least <= math.sqrt(least)]
     share, largest = (table.small_percent(pixels / measured[0]["hits"]) for pixels in (least, most))
     return (
-        f"Missed and spurious pixels are fewest, *{share}* of the hits, at epsilon = {' or '.join(similar)}, and at "
-        f"{worst:g} they are {largest}; n = one shape."
+        f"Missed and spurious pixels are fewest at epsilon = {' or '.join(similar)} scene units: *{share}* of the "
+        f"hits. At epsilon = {worst:g} they are {largest}; n = one shape."
     )
 
 

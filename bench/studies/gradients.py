@@ -22,24 +22,24 @@ VISIBILITY_HEADINGS = {  # headings of the metrics of the image at the outline
 }
 EDGES_NOTE = (
     "The silhouette's rays are no image, so edge sampling splits no pixels here. It has a band, like the relaxed "
-    "boundary, and nearly the same numbers. The page outline has it with whole images."
+    "boundary, and nearly the same numbers. The page “outline” has edge sampling with whole images."
 )
 NOTES = (
     "A pooled number compares the gradients of all pixels of a band as one long vector. A factor that differs between "
     "pixels lowers the pooled cosine, but not the cosine of a single pixel.",
     "An error is the length of the difference divided by the length of the true gradient. Hits are frontal, oblique or "
-    "grazing, by the angle between ray and normal. The silhouette is one image.",
+    "grazing, by the angle between ray and normal. The gradient of the silhouette is that of one image.",
     "Excluded: pixels where visibility changes, the root is not found again, or the renderer misses or hits another "
     "surface.",
     "Colour: the gradient of a smooth colour of point and normal, for shape (code), camera and colours (texture).",
-    "The silhouette is at each renderer's default blur; the page gradients_visibility has equal blurs.",
+    "The silhouette is at each renderer's default blur. The page “gradients_visibility” has equal blurs.",
     EDGES_NOTE,
 )
 VISIBLE_NOTES = (
     "A pixel at the outline is the mean distance of many rays; a miss has the distance of the far side of the unit "
     "sphere. The true gradient is a central difference of this image, so changes of visibility are included.",
-    "Error: the length of the difference divided by the length of the true gradient, so zeros have an error of 1. "
-    "Noise: the error with one ray per pixel; it falls with the square root of the number of rays.",
+    "Error: the length of the difference divided by the length of the true gradient, so a gradient of zero has "
+    "an error of 1. Noise: the error with one ray per pixel. It falls with the square root of the number of rays.",
     "Blur: the length over which a renderer spreads the visibility gradient (NeuS: 1/s, VolSDF: beta, UNISURF: width "
     "of the occupancy, relaxed boundary: the band). A pixel at the outline is about 0.01 scene units wide.",
     "A blur of a pixel or more moves the gradient to neighbouring pixels. This lowers the cosine and the scale of a "
@@ -57,9 +57,9 @@ def make(runs: Runs) -> Result:
         runs,
         "Errors of the gradients.",
         "Cosine and scale of a renderer's gradient relative to the true gradient (1 if exact), pooled over a band of "
-        "pixels and per pixel, and the relative error; the figure has the median error and, for the silhouette, cosine "
-        "and scale.",
-        question="How accurate are the gradients?",
+        "pixels and per pixel, and the relative error. The figure has the median relative error of hits and, for the "
+        "silhouette, cosine and scale.",
+        question="How accurate are the gradients of each renderer?",
         verdict=_verdict(data),
         remarks=(*NOTES, f"The figure's logarithmic axes leave out {unseen} errors of exactly zero." if unseen else ""),
         columns=COLUMNS,
@@ -114,7 +114,7 @@ def _verdict(data: pd.DataFrame) -> str:
     reached = f"{(least >= 0.99).sum()} of {len(least)}"
     names = "; ".join(map(str, least.index[least >= 0.99]))
     which = f"the code: {names}" if names else "the code"
-    title = f"{reached} reach a pooled cosine of 0.99 in all bands of hits, for {which}. Lowest band"
+    title = f"{reached} rows reach a pooled cosine of 0.99 in all bands of hits, for {which}. Cosine of the lowest band"
     return table.extremes(title, least.to_dict(), "one shape", show=_cosine, largest_first=True)
 
 
@@ -130,7 +130,8 @@ def _visibility_verdict(data: pd.DataFrame) -> str:
         )
     if len(sharp):
         most = sharp[[*IMAGE_METRICS]].max()
-        parts.append(f"Renderers that differentiate only hits have at most {most.iloc[0]:.3g} and {most.iloc[1]:.3g}")
+        ends = f"a cosine of at most {most.iloc[0]:.3g} and a scale of at most {most.iloc[1]:.3g}"
+        parts.append(f"Renderers that differentiate only hits have {ends}")
     return f"{'. '.join(parts)} (n = one shape)." if parts else ""
 
 
@@ -164,7 +165,7 @@ def draw_visibility(data: pd.DataFrame) -> Figure:
             for (row, preset), row_data in data[data["blur"].notna()].groupby(["name", "preset"], sort=False)
         ]
         for end in ("min", "max") if len(sharp) else ():
-            label = f"without a blur ({sharp['name'].nunique()} renderers)"
+            label = f"without a blur: least and most of {sharp['name'].nunique()} rows"
             lines.append(chart.level(label, blurs, getattr(sharp[name], end)()))
         lines.append(chart.level("exact", blurs, 1.0, dash=":"))
         panels.append(chart.panel_data("", "blur (scene units)", VISIBILITY_HEADINGS[name].lower(), lines))

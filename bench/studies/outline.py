@@ -11,15 +11,16 @@ RAYS = "view.rays_per_pixel"
 READS = (Selection("outline", (RAYS,), setup=Selection.WITHOUT_MACHINE),)
 CONTROLS = tuple(f"outline_{name}_{kept}" for name in ("relaxed", "neus") for kept in ("mask", "fraction"))
 NOTES = (
-    "A prior's code is fitted to the mask of one image of 24 x 24 pixels, without depth. The penalty of the code has a small weight.",
+    "A prior's code is fitted to the mask of one image of 24 x 24 pixels, without depth. The penalty of the code has a "
+    "small weight.",
     "The area error sums the differences between the fractions of pixels that the fitted and the true mesh cover, each "
     "by 8 x 8 rays. At the start, the mean shape has an error of {start:.3g} pixels (median over shapes).",
     "Rows with “area” in their name compare a pixel's mean opacity with the fraction that the shape covers. The others "
     "compare single rays: if the shape covers a fraction k of a pixel, k n of its n rays should hit. Rays that hit are "
     "chosen first, in random order, and then the rays nearest to the surface.",
     "A single ray goes through the centre of the pixel. With 4 and 16 rays, each iteration draws a random ray in each "
-    "of 2 x 2 or 4 x 4 squares of the pixel. Edge sampling splits these squares, as it splits pixels with 1 ray. All rows "
-    "have 60 iterations, whatever their rays cost.",
+    "of 2 x 2 or 4 x 4 squares of the pixel. Edge sampling splits these squares, as it splits pixels with 1 ray. All "
+    "rows have 60 iterations, whatever their rays cost.",
     "Rows may have fewer shapes with 16 rays than with 1. Compare their ratios, not their medians.",
     "A run that is not ok counts with its result, if it has one. With `not_reached`, its loss did not fall.",
     "With 1 ray, a pixel's observation is its mask at the centre. With several, it is the covered fraction. Rows with "

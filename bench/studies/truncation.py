@@ -18,7 +18,7 @@ SERIES = {  # (truncated prior, clamped steps): name, and the preset that gives 
 }
 DISTANCES = (False, False)
 SHAPE = ["family", "solid"]
-WRONG, COST = "wrong pixels (share of hits)", "field evaluations (ratio)"
+WRONG, COST = "wrong pixels (fraction of hits)", "field evaluations\n(relative to distances, alpha = 1)"
 COLUMNS = (
     *(table.text("field", "Field and steps"), table.Column("alpha", "Alpha"), table.Column("shapes", "Shapes")),
     *(
@@ -30,8 +30,9 @@ COLUMNS = (
 NOTES = (
     "Wrong pixels are missed, spurious, or more than 0.02 scene units off in depth, relative to the hits of a float64 "
     "reference. The ratio of evaluations is relative to plain sphere tracing of distances: alpha = 1, no clamp.",
-    "A truncated field is a prior trained on distances clamped at 0.1 scene units, like DeepSDF's networks. Beyond, "
-    "its values are not constrained. Clamped steps clamp field values at 0.1 before alpha, like DIST's official code.",
+    "A truncated field is a prior trained on distances clamped at 0.1 scene units, like DeepSDF's networks. Farther "
+    "from the surface, its values are not constrained. Clamped steps clamp field values at 0.1 before alpha, like "
+    "DIST's official code.",
 )
 Kind = tuple[bool, bool]  # whether the prior is truncated, and whether steps are clamped
 Line = dict[str, Any]
@@ -85,10 +86,10 @@ def _verdict(lines: dict[tuple[Kind, float], Line]) -> str:
     wrong = {name: table.small_percent(lines[kind, 1.5]["wrong"]) for name, kind in kinds.items()}
     plain, clamped, both = (lines[kind, 1.5] for kind in kinds.values())
     return (
-        f"At alpha = 1.5, *{wrong['plain']}* of the pixels are wrong on distances, {wrong['clamped']} with clamped "
-        f"steps and {wrong['both']} on a truncated field with clamped steps; n = {plain['shapes']} shapes. "
-        f"Clamped steps cost {clamped['cost']:.2f} and {both['cost']:.2f} times the field evaluations of alpha = 1 "
-        "without clamp."
+        f"Wrong pixels at alpha = 1.5, relative to the hits: *{wrong['plain']}* on distances, {wrong['clamped']} with "
+        f"clamped steps, {wrong['both']} on a truncated field with clamped steps; n = {plain['shapes']} shapes. Field "
+        f"evaluations of these three, relative to alpha = 1 on distances: {plain['cost']:.2f}, {clamped['cost']:.2f} "
+        f"and {both['cost']:.2f}."
     )
 
 

@@ -147,13 +147,13 @@ def test_gradients_have_a_row_for_each_renderer_and_band(tmp_path):
     assert (rows.loc["naive", "status"] == "oom").all() and rows.loc["naive", "code_scale"].isna().all()
     assert page.table.loc[0, ["Code pooled cosine", "Code scale", "Pixels"]].tolist() == ["0.99000", "1.00", "100"]
     assert "A pooled number compares the gradients of all pixels of a band" in told(page)
-    assert "0 of 3 reach a pooled cosine of 0.99 " in page.verdict and ": *0.97000* (dist)" in page.verdict
+    assert "0 of 3 rows reach a pooled cosine of 0.99 " in page.verdict and ": *0.97000* (dist)" in page.verdict
 
 
 def test_a_renderer_without_a_number_in_a_band_has_no_least_one():
     known = [("a", band, "ok", 0.995) for band in gradients.ANGLES] + [("b", "frontal", "ok", 0.999)]
     said = gradients._verdict(pd.DataFrame(known, columns=["name", "band", "status", "code_pooled_cosine"]))
-    assert said.startswith("1 of 2 reach a pooled cosine of 0.99 in all bands of hits, for the code: a. Lowest band")
+    assert said.startswith("1 of 2 rows reach a pooled cosine of 0.99 in all bands of hits, for the code: a. Cosine of")
     assert ": *0.99500* (a); " in said
 
 
@@ -188,7 +188,9 @@ def test_what_comes_into_view_has_a_row_for_each_blur(tmp_path):
     assert rows.loc["naive", "status"] == "oom"
     cosine, scale = page.figure.axes
     assert drawn(cosine, "neus") == [0.9, 0.9] and drawn(scale, "neus", "x") == [0.001, 0.03]
-    sharp = [line.get_ydata()[0] for line in cosine.lines if line.get_label() == "without a blur (2 renderers)"]
+    sharp = [
+        line.get_ydata()[0] for line in cosine.lines if line.get_label() == "without a blur: least and most of 2 rows"
+    ]
     assert sharp == [0.5, 0.9]
     assert page.verdict.startswith("neus has a cosine of *0.90* and a scale of 1.10 at a blur of 0.001 scene units. ")
 
@@ -263,14 +265,14 @@ def test_fig7_is_in_order_of_epsilon_and_plots_the_shares(tmp_path):
     shown = page.table[["Epsilon", "Missed", "Spurious"]].to_numpy().tolist()
     assert shown[0] == ["0.0500", "1.00 %", "25.0 %"] and shown[1][1:] == ["–", "–"]
     assert "killed (stopped)" in told(page)
-    assert "fewest, *0.250 %* of the hits, at epsilon = 5e-05, and at 0.05 they are 26.0 %" in page.verdict
+    assert "at epsilon = 5e-05 scene units: *0.250 %* of the hits. At epsilon = 0.05 they are 26.0 %" in page.verdict
 
 
 def test_counts_of_wrong_pixels_within_their_noise_are_named_together(tmp_path):
     for epsilon, lost in ((5e-4, 208), (5e-5, 209), (5e-3, 425)):
         metrics = costs(lost=lost, false=0, hits=14167)
         write_images(write_run(tmp_path, "fig7", None, metrics=metrics, settings={"renderer": {"epsilon": epsilon}}))
-    assert "fewest, *1.47 %* of the hits, at epsilon = 0.0005 or 5e-05, and" in page_of(tmp_path, "fig7").verdict
+    assert "at epsilon = 0.0005 or 5e-05 scene units: *1.47 %* of the hits." in page_of(tmp_path, "fig7").verdict
 
 
 def test_pictures_are_of_one_scene(tmp_path):
