@@ -57,3 +57,14 @@ def test_priors_are_compared_within_a_renderer_and_a_failed_prior_has_no_ratio(t
     lines = page_of(tmp_path, "prior_sizes").data.set_index("row")
     assert lines.loc["small, dist", "ratio"].startswith("0.500") and lines.loc["small, dvr", "ratio"] == ""
     assert lines.loc["large, dist", "ratio"] == lines.loc["large, dvr", "ratio"] == ""
+
+
+def test_a_failed_run_is_named_by_its_label_without_its_sizes(tmp_path):
+    for layers, (name, (width, code)) in zip((2, 4), SIZES.items(), strict=True):
+        network = {"layers": layers, "width": width, "code_length": code, "skip": layers - 2, "narrow": False}
+        status, settings = "crashed" if name == "small" else "ok", {"prior": {"network": network}}
+        write_run(
+            tmp_path, "prior_sizes", name, renderer="dist", metrics={"chamfer_l2": 1.0}, settings=settings,
+            flops=1.0, status=status, reason="why",
+        )  # fmt: skip
+    assert "1 of 2 runs did not end ok: small: crashed (why)" in page_of(tmp_path, "prior_sizes").caption

@@ -168,12 +168,28 @@ class Runs:
         getters = {"": family, "seed ": itemgetter("seed"), "shape ": index}
         varying = [(word, get) for word, get in getters.items() if len({str(get(run)) for run in self.records}) > 1]
         names = []
+        fixed = self._fixed_by_labels()
         for record in self.records:
-            values = {key: setting(record["config"], *key.split(".")) for key in self.selection.conditions}
+            keys = [key for key in self.selection.conditions if key not in fixed]
+            values = {key: setting(record["config"], *key.split(".")) for key in keys}
             shown = {key.rpartition(".")[2]: value for key, value in values.items()}
             conditions = [f"{value} {key}" for key, value in shown.items() if isinstance(value, str | int | float)]
             names.append(", ".join([row_of(record).name, *conditions, *(f"{w}{get(record)}" for w, get in varying)]))
         return names
+
+    def _fixed_by_labels(self) -> set[str]:
+        """The conditions that differ between rows and not within one, if all runs have labels, which then name them."""
+        if not all(record["config"].get("label") for record in self.records):
+            return set()
+        values = {
+            key: [{str(setting(run["config"], *key.split("."))) for run in row} for row in self.rows().values()]
+            for key in self.selection.conditions
+        }
+        return {
+            key
+            for key, of_rows in values.items()
+            if all(len(of_row) == 1 for of_row in of_rows) and len(set[str]().union(*of_rows)) > 1
+        }
 
     def machines(self) -> dict[tuple[Any, ...], list[str]]:
         """The names of the runs by machine: processor, accelerator, threads, and whether kernels are compiled."""
