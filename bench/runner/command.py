@@ -1,8 +1,9 @@
-"""The command line: arguments become a run or a sweep, and every mistake becomes one clear line."""
+"""The command line: arguments become a run or a sweep, and every mistake becomes one clear message."""
 
 import os
 import re
 import sys
+import textwrap
 import traceback
 from argparse import ArgumentError, ArgumentParser, Namespace
 from collections.abc import Callable
@@ -38,6 +39,7 @@ HELP = """
 
 Any setting is KEY=VALUE: seed=1, threads=2, time_limit=600, results_dir=PATH, task.points=50, renderer.steps=30.
 --cfg job shows all settings and runs nothing; --config-dir PATH adds a folder of YAML."""
+MAX_MESSAGE_LETTERS, LINE_LETTERS = 400, 100  # a longer message, such as a list of all names, has several lines
 EXIT_FAILURE, EXIT_USAGE = 1, 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 KERNELS_VARIABLE = "IMPLICIT_BENCH_KERNELS"  # defined in renderers/kernels/library.py, which imports torch
@@ -184,7 +186,10 @@ def quote_text(argument: str) -> str:
 def _print_error(message: str, exit_status: int = EXIT_FAILURE) -> int:
     if any(argument.replace(" ", "").lower() == "verbose=true" for argument in sys.argv[1:]):
         traceback.print_exc()
-    print(f"error: {message}", file=sys.stderr)
+    text = f"error: {message}"
+    if len(text) > MAX_MESSAGE_LETTERS:
+        text = textwrap.fill(text, LINE_LETTERS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    print(text, file=sys.stderr)
     return exit_status
 
 

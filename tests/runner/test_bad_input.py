@@ -108,6 +108,12 @@ def test_the_command_reports_a_mistake_in_one_line_and_leaves_nothing(bench, tmp
     assert not list((tmp_path / "r" / "runs").glob("*"))
 
 
+def test_a_long_list_of_names_has_short_lines(bench):
+    code, _, err = bench("task=stability", "stress=?")
+    assert code == 2 and max(map(len, err.splitlines())) <= 100
+    assert {"thin_plate,", "wires,"} <= {*err.split()}
+
+
 def test_unknown_kernels_are_refused_before_a_run(bench, tmp_path, no_prior, monkeypatch):
     monkeypatch.setenv("IMPLICIT_BENCH_KERNELS", "quick")
     status, _, err = bench(*TINY, f"results_dir={tmp_path / 'results'}")
