@@ -11,22 +11,23 @@ READS = (Selection("as_printed", ("task.points",), may_differ=("prior.truncation
 NOTES = (
     compare.ERROR,
     f"{compare.RATIO} {compare.FAILURE}",
-    "DeepSDF's samples have 300 iterations and settings that were chosen on validation shapes. The official code's row "
-    "has its 800 iterations, rate and weight of the code. The official code also clamps values at 0.1, lets the rate "
-    "fall once, to a tenth at half, and takes 8,000 samples per step.",
+    "DeepSDF's samples have 300 iterations and settings that were chosen on validation shapes. The row “official "
+    "code's” has the 800 iterations, the learning rate and the weight of the latent code of DeepSDF's official code. "
+    "That code also clamps values at 0.1, divides the rate by ten after half of the iterations, and takes 8,000 "
+    "samples per step.",
     "In DIST, Table 2, dense, the errors are 0.77 (sofas), 0.59 (planes) and 0.42 (tables) times DeepSDF's errors.",
 )
 PAPER = (
     "“Both”: the truncated prior with clamped steps. All rows of DIST also march aggressively, as the page "
-    "`truncation` explains. The clamp and the mean of the squared code are from the official code. The paper does not "
-    "give the average of its silhouette loss (Eq. 11); we take the mean over all pixels.",
+    "“truncation” explains. The clamp and the mean of the squared latent code are from DIST's official code. The paper "
+    "does not give the average of its silhouette loss (Eq. 11); we take the mean over all pixels.",
     "DIST has the paper's 100 iterations (B.4) where no other number is named. The official mask loss differs in its "
     "average and its sign. Rows with two or three changes were added after the rows with one change were measured.",
     "“Neither”, “clamp alone”, “DIST with mask” and “DeepSDF samples” use the prior that is not truncated.",
 )
 DEFAULT = (
     "“Default” is “DIST with mask” with the named change. It has 100 iterations. Its cap on steps and its careful "
-    "split of rays stay. The row “both” is the paper's setting with two changes, see the page `as_printed`.",
+    "split of rays stay. The row “both” is the paper's setting with two changes, see the page “as_printed”.",
 )
 ALSO_SHOWN = ("dist_mask", "as_printed_official_long", "deepsdf_truncated", "deepsdf_official")
 Page = partial(compare.Comparison, hidden=("dense",))  # all runs have dense depth

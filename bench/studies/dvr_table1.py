@@ -16,11 +16,12 @@ NOTES = (
     "Each shape is unseen in training, and has one input image. Its other images evaluate the mask and the colours.",
     "Training from images begins with the visual hull of the masks, without a renderer. “Masks, hull” has only that.",
     "“DVR's own”: occupancy, DVR's renderer and losses from the first step. With RGB, the hull gives the depth of Eq. "
-    "15. At scale=desk, a step has 4 images of 128 rays; the learning rate is 1e-3; gradients are clipped to a norm of "
-    "1. A seed is one training run.",
+    "15. At scale=desk, a step has 4 images of 128 rays, the learning rate is 1e-3, and gradients are clipped to a "
+    "norm of 1. A seed is one training run.",
     "Without training: the latent code that DIST fits to the mask, with the known camera; the mean shape; the training "
     "shape with the nearest image; the training shape with the smallest Chamfer-L1, the limit of any retrieval.",
-    "“Over ...”: the median over shapes of the ratio of Chamfer-L1 to that row; below 1 is better.",
+    "“Over the mean shape” and “Over the nearest image”: the median over shapes of the ratio of Chamfer-L1 to that of "
+    "this row. A ratio below 1 is better.",
     "“Published” is DVR, Table 1: ShapeNet, in tenths of the largest edge of a shape's bounding box. These numbers "
     "cannot be compared directly with the measured rows.",
 )
@@ -68,7 +69,7 @@ def make(runs: Runs) -> Result:
         "Shape from one image.",
         "Medians over shapes for each kind of training, of costs over runs that ended ok; Chamfer-L1 in scene units, "
         "times 1000.",
-        question="Which observations must a training use, so that a network reconstructs a shape from one image?",
+        question="With which observations in training does a network reconstruct a shape best from one image?",
         verdict=" ".join(filter(None, (_verdict(name, rows) for name, rows in family_lines.items()))),
         interval=compare.INTERVAL,
         estimates=[line["interval"] for line in lines if "interval" in line],

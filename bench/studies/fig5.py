@@ -23,7 +23,7 @@ COLUMNS = (
 )
 NOTES = (
     "Chamfer distance is chamfer_l2, in squared scene units, times 1000. The optimisation does not use it.",
-    "A curve is the median over the runs of a row. A failed run is infinite after its end.",
+    "A curve is the median over the runs of a row. A failed run counts as infinite after its end.",
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over the iterations. "
     "Iterations of a run are not independent, so ρ is not a significance test.",
 )
@@ -69,7 +69,7 @@ def _verdict(lines: list[dict[str, Any]]) -> str:
     apart = [f"{row} (*{value:.2f}*)" for row, value in ranks.items() if value < curves.HIGH_RHO]
     alike = f"{curves.HIGH_RHO} or more in {len(ranks) - len(apart)} of {format.plural(len(ranks), 'different row')}"
     judgement = f"not in {', '.join(apart)}" if apart else "as in the paper"
-    return f"The median ρ of loss and error is {alike}; {judgement}." if ranks else ""
+    return f"The median rank correlation ρ of loss and error is {alike}; {judgement}." if ranks else ""
 
 
 def _ends(lines: list[dict[str, Any]]) -> str:

@@ -46,11 +46,11 @@ def make(runs: Runs) -> Result:
         "Shapes and colours of latent codes, rendered at several sizes, from several sides and lights.",
         "Renderings of the mesh and of its latent codes of shape and colour; a test shape has no code of training.",
         question="How accurate are the colours of a latent code, and how large is the code?",
-        verdict=f"Median error of colour {texts}; n = {format.plural(len(runs.records), 'shape')}. A code has "
-        f"{code:.0f} bytes, the network of all codes of a family {network / 1000:.0f} kB, the original mesh and "
-        f"texture {sum(mesh_and_texture) / 1000:.0f} kB (medians).",
+        verdict=f"Median error of colour (0 to 1): {texts}; n = {format.plural(len(runs.records), 'shape')}. "
+        f"A code has {code:.0f} bytes, the network of all codes of a family {network / 1000:.0f} kB, the original mesh "
+        f"and texture {sum(mesh_and_texture) / 1000:.0f} kB (medians).",
         remarks=(
-            "Meshes have their original triangles: a mesh with the error of its code has far fewer.",
+            "Meshes have their original triangles. A mesh with the same error as its code has far fewer.",
             "A “code of the image” is optimised from the colours and the mask of the given image, without depth.",
             f"Lights: colours times {AMBIENT:g} + {1 - AMBIENT:g} max(normal · light, 0), without shadows.",
             *records.definitions(runs.records, DEFINED),

@@ -26,7 +26,7 @@ RUNS = (
 NOTES = (
     "Scans of one object depend on each other, so there is no interval. A ratio is the median over scans of the error "
     "with measured depths divided by the error with exact depths; it is 1 if both failed.",
-    "The depth error is for the observed view, and Chamfer for the whole shape.",
+    "The depth error is that of the observed view. The Chamfer distance is that of the whole shape.",
     "Exact depths are depths of the mesh at the pixels that the scanner measured. Both use the mask of the mesh.",
     "A failed run counts as infinite. A refused run is left out.",
 )

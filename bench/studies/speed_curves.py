@@ -16,9 +16,9 @@ ERROR = "Chamfer × 1000 (scene units²)"
 NOTES = (
     "The figure has a curve for the first setting of each renderer: medians over runs of cost and error at the "
     "checkpoints, after 1, 2, 4, ... iterations.",
-    f"The table has all settings, the number of runs that reached {CHAMFER_SCALE * TARGET_ERROR:g} × 10⁻³, and the "
-    "median time to this error, at the first checkpoint that has it: up to twice the true time. A run that failed or "
-    "never reached it counts as infinite.",
+    f"The table has all settings, the number of runs that reached an error × 1000 of {CHAMFER_SCALE * TARGET_ERROR:g}, "
+    "and the median time to this error. The time is that of the first checkpoint with the error, so it is up to twice "
+    "the true time. For a run that failed or never reached the error, it is infinite.",
     "ρ is the median over runs of Spearman's rank correlation of loss and Chamfer distance over a run's checkpoints.",
 )
 COLUMNS = (

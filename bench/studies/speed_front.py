@@ -33,7 +33,8 @@ NOTES = (
     "over pixels; missed and spurious pixels are infinite) over its time.",
     "Error and time are infinite for a failed run, and for a run that a setting lacks and others have. A setting with "
     "an infinite median is only in the table.",
-    "Filled points are on the front, numbered from the fastest. Hollow points are dominated.",
+    "Filled points are on the front, numbered from the fastest. Hollow points are dominated: another setting is faster "
+    "and has a smaller error.",
     "In brackets: the probability of being on the front, over 2,000 bootstrap draws of {shapes and seeds}. Settings "
     "that compute the same share their times.",
 )
@@ -141,14 +142,14 @@ def _verdict(panels: dict[Trial, list[Line]]) -> str:
     for trial, panel in panels.items():
         if front := _front(panel):
             ends = [
-                f"{p['setting']} (*{format.seconds(p['seconds'])}*, error × 1000 {format.number(p['error'])})"
+                f"*{format.seconds(p['seconds'])}* for an error × 1000 of {format.number(p['error'])} ({p['setting']})"
                 for p in (front[0], *front[1:][-1:])
             ]
             n = format.plural(panel[0]["shapes"], "shape")
             sure = sum(line["on_front"] >= LIKELY for line in front)
-            on_front = f"{len(front)} of {len(panel)} settings are on the front of {trial.title}, {sure} of them in "
+            on_front = f"{len(front)} of {len(panel)} settings are on this front, {sure} of them in "
             on_front += f"{100 * LIKELY:.0f} % of the bootstrap draws or more; n = {n}."
-            return f"{on_front} From the fastest to the best: {' to '.join(ends)}."
+            return f"The front of {trial.title}, from the fastest to the best: {' to '.join(ends)}. {on_front}"
     return ""
 
 

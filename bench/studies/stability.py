@@ -56,10 +56,9 @@ NOTES = (
     "“Breaks first” and “Then” are the axes with the lowest breakdowns. Among equal ones, the axis on which the median "
     "renderer survives most is shown. “Best on” is the axis on which the renderer is farthest above the median "
     "renderer. Settings of renderers are left out.",
-    "Intervals are those of the shown axis. They do not cover the choice of the axis. The mean rank is over the "
+    "An interval is that of the shown axis. It does not cover the choice of the axis. The mean rank is over the "
     "{ranked_axes} axes that judge renderings, with its bootstrap interval over axes.",
-    "Each renderer has one preset. python -m bench.report also writes the page “stability_axes”, with all presets and "
-    "all numbers.",
+    "Each renderer has one preset. The page “stability_axes” has all presets and all numbers.",
 )
 
 

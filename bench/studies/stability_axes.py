@@ -15,8 +15,9 @@ COST_AXES = ("field evaluations per ray at the mildest severity, median", "mean 
 AXES_NOTES = (
     "The adaptive search makes {share:.0f} % of the trials of a full grid. Every renderer gets the same trials at a "
     "severity. Renderings have {resolution}×{resolution} pixels.",
-    "A renderer survives if its breakdown lies beyond the severest severity. Ends of the sweep have their failed "
-    "trials, with the interval of the probability (Clopper and Pearson). “–”: the renderer lacks that setting.",
+    "A renderer survives if its breakdown lies beyond the severest severity. A breakdown at an end of the axis has the "
+    "failed trials there, and the interval of their probability (Clopper and Pearson). “–”: the renderer lacks that "
+    "setting.",
     "If success rises with severity, there is no breakdown. “One trial”: repeats cannot differ, and the breakdown is "
     "between two neighbouring severities.",
     "If a disturbance moves the surface, the moved surface is the ground truth. The CSV of the page “stability” has "
@@ -54,6 +55,13 @@ def make_axes(runs: Runs) -> Result:
     settings: dict[str, Any] = {**breakdowns.criteria(runs)}
     settings["resolution"] = records.setting(task, "resolution")
     settings["share"] = 100 * trials / max(cells["grid_trials"].sum(), 1)
+    survived = table.extremes(
+        "Kinds of stress that do not break a renderer at any tested severity",
+        cells.groupby("row", sort=False)["never"].sum().to_dict(),
+        f"{trials:.0f} trials on {len(axes)} axes",
+        show=table.integer,
+        largest_first=True,
+    )
     words = breakdowns.grid(cells, axes, "words").fillna("").reset_index(drop=True)
     words.insert(0, "Axis", [breakdowns.title(axis) for axis in axes.index])
     words.insert(1, "Unit", list(axes["unit"]))
@@ -61,19 +69,26 @@ def make_axes(runs: Runs) -> Result:
         runs,
         "The severity at which each renderer breaks.",
         "The severity at which half of the trials succeed, on each axis (kind of stress).",
-        question="At which severity of stress does each renderer break?",
-        verdict=table.extremes(
-            "Kinds of stress that do not break a renderer at any tested severity",
-            cells.groupby("row", sort=False)["never"].sum().to_dict(),
-            f"{trials:.0f} trials on {len(axes)} axes",
-            show=table.integer,
-            largest_first=True,
-        ),
+        question="Which kinds of stress does each renderer survive, and at which severity do the others break it?",
+        verdict=f"{survived} {_breaking(cells)}".strip(),
         n=f"{trials:.0f} trials in all, of {len(axes)} axes and {len(rows)} renderers",
         interval="95 % credible intervals, the milder end first",
         remarks=[note.format(**settings) for note in AXES_NOTES],
         columns=[table.text(name, name) for name in words],
         lines=words.to_dict("records"),
+    )
+
+
+def _breaking(cells: pd.DataFrame) -> str:
+    """A sentence on the severities at which renderers break; empty if none breaks inside an axis."""
+    measured = cells[cells["is_measured"]]
+    inside = measured.loc[~measured["at_once"] & ~measured["never"] & ~measured["rises"], "shade"]
+    if inside.empty:
+        return ""
+    return (
+        f"Of {len(measured)} pairs of renderer and axis, {measured['never'].sum()} have no breakdown, "
+        f"{measured['at_once'].sum()} have it at the mildest severity, and {len(inside)} have it inside the axis, at "
+        f"*{table.percent(inside.median())}* (median; 0 % is the mildest severity)."
     )
 
 
@@ -166,7 +181,7 @@ def _alike(ranks: dict[str, statistics.Interval]) -> str:
     if not similar:
         return f"All others can be distinguished from {best}."
     listed = f"*{len(similar)}* of the {len(ranks) - 1} others ({'; '.join(similar)})"
-    return f"Also, {listed} cannot be distinguished from {best}."
+    return f"In rank, {listed} cannot be distinguished from {best}."
 
 
 def _cost(cells: pd.DataFrame, row: str, rank: statistics.Interval) -> dict[str, Any]:

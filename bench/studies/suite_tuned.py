@@ -34,13 +34,14 @@ UNITS_OF_COST = 1.0
 KEEPS = partial(attempts_folder, subfolder=CANDIDATES)
 READS = selections()
 NOTES = (
-    "Candidates of a setting are the set's, a third of its learning rate (slower), three times its rate (faster), and "
-    "fewer rays for at least 160 iterations. They are the same for all renderers. The silhouette loss is the set's.",
+    "Candidates of a setting are that of the set (stated), a third of its learning rate (slower), three times its rate "
+    "(faster), and fewer rays for at least 160 iterations. They are the same for all renderers. The silhouette "
+    "loss is that of the set.",
     "The mean logarithm of the final errors on validation shapes chooses a candidate for each renderer and set. A "
     "failed run counts with its initial error, and a larger final error with itself. If the set's setting is chosen, "
     "its runs count.",
     "Significant: as on the page of the suite, by a sign-flip test over scenes with Holm's correction over all pairs "
-    f"at {ALPHA:.0%}. Both columns have the same problems.",
+    f"at {percent(ALPHA)}. Both columns have the same problems.",
 )
 
 
@@ -115,7 +116,8 @@ def verdict(tuned: Standing, stated: Standing) -> str:
     lead = leaders(ranked, f"With their own settings, at {units(UNITS_OF_COST)}")
     return (
         f"Spearman's correlation of both orders is *{rho:.2f}* ({format.plural(len(order), 'renderer')}). {lead} "
-        f"*{len(ranked.better)}* of {ranked.pairs} pairs differ, with the sets' settings {len(before.better)}; "
+        f"*{len(ranked.better)}* of {ranked.pairs} pairs differ significantly, with the sets' settings "
+        f"{len(before.better)}; "
         f"{turned or 'none'} of them in the other direction."
     )
 
@@ -124,7 +126,7 @@ def _notes(chosen: Chosen, problems: dict[str, int]) -> list[str]:
     counts = Counter(setting.replace("_", " ") for setting in chosen.values()).most_common()
     sample = ", ".join(f"{count} of {name}" for name, count in problems.items())
     return [
-        f"Chosen, over renderers and sets: {', '.join(f'{name} {count} times' for name, count in counts)}.",
+        f"Number of choices, over renderers and sets: {', '.join(f'{name} {count}' for name, count in counts)}.",
         f"Validation problems per renderer: {sample}. So few problems may choose a setting by chance.",
         f"The runs of the candidates are in the folder `{CANDIDATES}` next to those of the suite.",
     ]

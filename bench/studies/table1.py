@@ -10,7 +10,8 @@ ALIKE = ("dataset", "view", "prior", "task")
 READS = (Selection("table1", alike=ALIKE), Selection("table1_large", alike=ALIKE))  # 64 pixels, and the paper's 512
 NOTES = (
     "Forward is one rendering without gradients. A step is a rendering with gradients, the loss and the backward pass. "
-    "It takes longer than forward and backward together. In brackets: the smallest and the largest of several repeats.",
+    "It takes longer than forward and backward together. In brackets: the smallest and the largest time of several "
+    "repeats.",
     "“+ dynamic” also clamps field values to 0.1, like all rows below except “no clamp”. Naive tracing has no clamp.",
     "Field evaluations are those of one rendering. Coarse evaluations use bfloat16, away from the surface.",
     "Pixels and depths are compared with a float64 reference. Depth errors are in scene units, over the pixels that "
@@ -60,11 +61,12 @@ def _speedups(runs: Runs, size: int | None) -> str:
         if _requested(record) == size and record["status"] == "ok"
     }
     chain = [steps.get(preset, ("", None)) for preset in list(published("dist_table1"))[:-1]]
-    factors = [f"{name} *{above / time:.1f}*" for (_, above), (name, time) in pairwise(chain) if above and time]
+    factors = [f"{name} *{above / time:.1f}×*" for (_, above), (name, time) in pairwise(chain) if above and time]
     if not factors:
         return table.extremes(f"Step runtime at {size} pixels", dict(steps.values()), "one shape", show=format.seconds)
-    title = f"Speedup of a step at {size} pixels over the previous strategy"
-    return f"{title}: {', '.join(factors)}; n = one shape."
+    times = [format.seconds(time) for _, time in chain if time]
+    title = f"A step at {size} pixels takes {times[0]} at first and {times[-1]} with all strategies"
+    return f"{title}. Speedup over the previous strategy: {', '.join(factors)}; n = one shape."
 
 
 def _requested(record: records.Record) -> int | None:

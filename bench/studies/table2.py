@@ -9,8 +9,8 @@ READS = (Selection("table2", ("task.points",), may_differ=("prior.truncation",))
 HIDDEN_SUFFIXES = ("_paper", "_official")  # the figure leaves out these presets, to stay readable
 NOTES = (
     f"{compare.RATIO} {compare.FAILURE}",
-    "Dense depth includes the mask. “Paper's setting” is DIST, B.4, with the mean of the squared code of the official "
-    "code and our mean of the silhouette loss over all pixels. The figure leaves out the papers' settings.",
+    "Dense depth includes the mask. “Paper's setting” is DIST, B.4, with the official code's mean of the squared "
+    "latent code, and our mean of the silhouette loss over all pixels. The figure leaves out the papers' settings.",
     f"{compare.FITTED} “Published” is DIST, Table 2: 200 shapes of ShapeNet, with another prior and camera, and other "
     "numbers of points per percentage. These numbers do not compare with the measured ones.",
 )
@@ -56,8 +56,8 @@ def _iterations(runs: Runs) -> str:
     groups = records.grouped(runs.records, records.iterations_of)
     names = {n: list(dict.fromkeys(records.row_of(r).name for r in group)) for n, group in groups.items() if n}
     usual = max(names, key=lambda count: len(names[count]), default=None)
-    others = [f"{', '.join(rows)} {count}" for count, rows in names.items() if count != usual]
-    return f"Iterations: {'; '.join([str(usual), *others])}." if names else ""
+    others = [f"{count} of {'; '.join(rows)}" for count, rows in names.items() if count != usual]
+    return f"Iterations of a run: {'. Others: '.join([str(usual), *others])}." if names else ""
 
 
 def pictures(runs: Runs) -> Result:
@@ -104,7 +104,7 @@ PAGE = compare.Comparison(
     name="DIST with mask",
     notes=_notes,
     plotted="Median error over {shapes and seeds} for each number of depth points, and for all numbers together.",
-    least_of="errors × 1000 over all numbers of depth points",
+    least_of="Chamfer × 1000 (scene units²) over all numbers of depth points",
     above=lambda compared: {compare.ORACLE: compared.oracles},
     published="dist_table2",
     hidden=compare.COSTS,

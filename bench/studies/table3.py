@@ -87,7 +87,7 @@ PAGE = compare.Comparison(
     notes=_notes,
     plotted="Median error over {shapes and seeds}; median over shapes alone, with its ratio to DIST; median cost of "
     "runs that ended ok.",
-    least_of="errors × 1000 from ground truth to prediction",
+    least_of="Chamfer × 1000 (scene units²) from ground truth to prediction",
     metric=records.ONE_WAY,
     label=conditions.LABEL,
     above=_above,

@@ -59,9 +59,9 @@ def test_the_front_is_of_those_that_none_beats_and_the_others_stay(three):
     assert data["on_front"].to_dict() == pytest.approx(expected, abs=0.03)
     assert data.loc["good", ["seconds", "error"]].tolist() == pytest.approx([3.0, 0.6])
     assert data.loc["broken", ["failed", "runs"]].tolist() == [2, 3] and math.isinf(data.loc["broken", "error"])
-    ends = "fast (*1.00 s*, error × 1000 7.00) to good (*3.00 s*, error × 1000 0.600)"
-    assert page.verdict.startswith("2 of 4 settings are on the front of completing a shape, 1 of them in 90 %")
-    assert "; n = 3 shapes. " in page.verdict and page.verdict.endswith(f": {ends}.")
+    ends = "*1.00 s* for an error × 1000 of 7.00 (fast) to *3.00 s* for an error × 1000 of 0.600 (good)."
+    assert "2 of 4 settings are on this front, 1 of them in 90 %" in page.verdict
+    assert page.verdict.endswith("; n = 3 shapes.") and f": {ends}" in page.verdict
 
 
 def test_dominated_points_are_hollow_and_the_front_is_numbered(three):

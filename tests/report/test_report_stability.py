@@ -56,7 +56,8 @@ def test_a_breakdown_stands_with_its_interval(tmp_path):
     broke(tmp_path, "wires", "DVR", 1.1)
     page = page_of(tmp_path, "stability_axes")
     assert page.table.iloc[0].tolist()[:3] == ["thin wires", "scene units", "0.100 (0.126 to 0.0794)"]
-    assert page.verdict.endswith(": *1* (DVR) to 0 (DIST); n = 20 trials on 1 axes.")
+    assert ": *1* (DVR) to 0 (DIST); n = 20 trials on 1 axes. Of 2 pairs of renderer and axis, 1 have" in page.verdict
+    assert page.verdict.endswith("1 have it inside the axis, at *50 %* (median; 0 % is the mildest severity).")
     assert "n = 20 trials in all, of 1 axes and 2 renderers" in told(page) and "25 % of the trials" in told(page)
     first = page_of(tmp_path, "stability")
     assert first.data["full"].iloc[0] == "0.100 scene units (0.126 to 0.0794)"

@@ -140,13 +140,13 @@ def _machines(runs: Runs) -> str:
     machines = runs.machines()
     if len(machines) < 2:
         return ""
-    each = [f"{_machine(*machine) or 'unnamed machine'} ({_listed(rows)})" for machine, rows in machines.items()]
-    return f"Do not compare times of different machines, numbers of threads or kernels: {'; '.join(each)}."
+    each = [f"{_machine(*machine) or 'unnamed machine'}: {_listed(rows, '; ')}" for machine, rows in machines.items()]
+    return f"Do not compare times of different machines, numbers of threads or kernels. {'. '.join(each)}."
 
 
 def _loaded(runs: Runs) -> str:
     names = [record["name"] for record in runs.named() if doubtful(record)]
-    few = _listed(names) if len(names) <= MAX_LISTED_NAMES else f"{len(names)} of {len(runs.records)} runs"
+    few = "; ".join(names) if len(names) <= MAX_LISTED_NAMES else f"{len(names)} of {len(runs.records)} runs"
     rows = "all rows" if len(names) == len(runs.records) > 1 else few
     says = (
         "Times are not reliable, see the notes of the runs" if runs.timed else "No runtimes, since the machine had load"
@@ -165,6 +165,6 @@ def _failure(record: Record) -> str:
     return f"{record['name']}: {record['status']} ({reason.rstrip('.')})"
 
 
-def _listed(names: list[str]) -> str:
+def _listed(names: list[str], separator: str = ", ") -> str:
     more = len(names) - MAX_LISTED_NAMES
-    return ", ".join(names[:MAX_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")
+    return separator.join(names[:MAX_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")
