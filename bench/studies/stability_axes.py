@@ -181,7 +181,7 @@ def _alike(ranks: dict[str, statistics.Interval]) -> str:
     if not similar:
         return f"All others can be distinguished from {best}."
     listed = f"*{len(similar)}* of the {len(ranks) - 1} others ({'; '.join(similar)})"
-    return f"In rank, {listed} cannot be distinguished from {best}."
+    return f"Also, {listed} cannot be distinguished from {best}."
 
 
 def _cost(cells: pd.DataFrame, row: str, rank: statistics.Interval) -> dict[str, Any]:

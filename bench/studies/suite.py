@@ -55,16 +55,17 @@ PROGRESS = (
     "Area is multiview with four rays per pixel. Masks state the fraction of each pixel that the shape covers. "
     "Renderers with opacities compare areas, the others have DIST's mask loss. The weights of both losses were chosen "
     "on four validation shapes, for the relaxed boundary and NeuS.",
-    f"Significant: by a sign-flip test over scenes, with Holm's correction over all pairs of a budget at {ALPHA:.0%}. "
-    f"If more than {100 * MAX_LEVEL:.1f} % of simulated draws of equal renderers have a false pair at that level, "
-    "no pair counts as significant. All scenes are of four families of shapes, so the test covers no others.",
+    "Significant: by a sign-flip test over scenes, with Holm's correction over all pairs of a budget at "
+    f"{percent(ALPHA)}. If more than {100 * MAX_LEVEL:.1f} % of simulated draws of equal renderers have a false pair "
+    "at that level, no pair counts as significant. All scenes are of four families of shapes, so the test covers no "
+    "others.",
 )
 
 BIAS = (
     "Depth bias: the median over pixels of the final surface's depth minus the true one, in scene units. It is "
     "negative in front of the true surface. The table has its mean over scenes. A small systematic error of hits "
     "shows there, and not in the final error. Sign-flip tests over scenes compare rows with DIST, with Holm's "
-    f"correction over rows and sets of a budget at {ALPHA:.0%}."
+    f"correction over rows and sets of a budget at {percent(ALPHA)}."
 )
 TUNED = (
     "Tuned: each renderer with its own learning rate and rays, chosen on validation shapes. With fewer problems than "
@@ -329,7 +330,7 @@ def failures(made: Standing) -> str:
         + " and ".join(f"{units(key[1])} ({line.failed} of {line.runs})" for key, line in at_budgets.iterrows())
         for (row, name), at_budgets in most.groupby(level=["row", "set"], sort=False)
     ]
-    return f"{'; '.join(names)}; {failed or 'none'} of {runs} others failed."
+    return f"{'; '.join(names)}; {failed or 'none'} of the {runs} other runs failed."
 
 
 def _first_of_sets(made: Standing) -> str:

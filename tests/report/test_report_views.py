@@ -159,7 +159,7 @@ def test_poses_found_are_counted_at_each_angle(tmp_path):
     assert mine["30°"] == "2 of 4 (n = 1)"  # a failed run is a pose that was not found; one shape, no interval
     assert mine["90°"] == "0 of 1 (n = 1)"
     assert theirs["30°"] == "4 of 4 (n = 1)"
-    assert "fewer than six shapes: points, no interval" in result.caption
+    assert "fewer than six shapes: a small point per shape, no interval" in result.caption
     assert theirs["90°"] == ""
     assert (mine["Runtime"], theirs["Runtime"]) == ("2.00 s", "250 ms")
     assert "1 of 9 runs did not end ok: DIST, 30 degrees, seed 3: nan (" in result.caption

@@ -613,7 +613,7 @@ def test_the_answer_says_what_differs_at_each_budget_what_failed_and_what_scenes
     lost = [attempt("Lost", scene, {0: 1.0, 50: 1.0}, status="diverged", final=inf) for scene in TEN]
     answer = study.verdict(page([*made(rows, TEN), *lost], tmp_path / "three", monkeypatch))
     assert answer.startswith("At 1 unit, B (*100 %*) makes significantly more progress than 2 others. 3 of 3 pairs")
-    assert "Lost failed in complete at 1 unit (10 of 10); none of 20 others failed." in answer
+    assert "Lost failed in complete at 1 unit (10 of 10); none of the 20 other runs failed." in answer
     few = [one for one in made(rows, TEN) if one.scene in TEN[:3]]
     said = study.verdict(page(few, tmp_path / "few", monkeypatch))
     assert said.startswith("At 1 unit, 3 scenes cannot decide ") and said.endswith("None of 6 runs failed.")

@@ -42,7 +42,7 @@ def fill_varying(runs: Runs, text: str) -> str:
 def interval_text(interval: str, estimates: Iterable[Interval], *, drawn: bool) -> str:
     """The kind of interval of the shown estimates; with few shapes, a text that says that there is none."""
     has_interval = [estimate.has_ends for estimate in estimates]
-    few_note = f"{FEW}: {'points, ' if drawn else ''}no interval; n in brackets counts shapes"
+    few_note = f"{FEW}: {'a small point per shape, ' if drawn else ''}no interval; n in brackets counts shapes"
     if all(has_interval):
         return interval
     return f"{interval}; {few_note}" if any(has_interval) else few_note
