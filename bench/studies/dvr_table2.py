@@ -13,8 +13,8 @@ READS = (Selection("dvr_table2", setup=("scenes", "machine")),)
 SEEN_ERROR, SEEN_LABEL = "seen_chamfer_l1", "Chamfer-L1, seen × 1000"
 NAMES = ("seen_accuracy", "seen_completeness", SEEN_ERROR, "chamfer_l1", "psnr", "ssim", "mask_iou")
 NOTES = (
-    "“Seen”: the parts of both surfaces that a photograph of the input shows; none shows the underside. Distances are "
-    "in scene units, times 1000. Two samples of 30,000 points of one surface have a Chamfer-L1 of 5.7 to 7.1.",
+    "“Seen”: the parts of both surfaces that an input photograph shows. No photograph shows the underside. Distances "
+    "are in scene units, times 1000. Two samples of 30,000 points of one surface have a Chamfer-L1 of 5.7 to 7.1.",
     "Colours are compared at hits in held-out photographs. For volume renderers and the relaxed boundary, they are "
     "compared at all pixels of the mask, on black.",
     "Volume renderers use the cross entropy between opacity and mask, and a limited number of samples per ray.",

@@ -13,8 +13,8 @@ CONTROL_ROWS = tuple(f"multiview_area_{kind}{name}" for kind in ("fraction", "ce
 MASK_ROWS = tuple(f"multiview_mask{name}" for name in ("", "_neus", "_opaque", "_volsdf", "_unisurf"))
 NOTES = (
     "A prior's code is fitted, from a random code, to the colours and silhouettes of 12 photographs of 32 x 32 pixels. "
-    "With several rays, the mean colour of a pixel is compared, if all of its rays hit and the neighbouring photograph "
-    "sees at least half of their points.",
+    "With several rays, the mean colour of a pixel is compared, but only if all of its rays hit and the neighbouring "
+    "photograph sees at least half of their points.",
     "All runs have the same budget of field evaluations. An iteration draws a pixel of each block of 1, 2, 4 or 8 "
     "pixels per side: the smallest block with which the budget pays for 40 iterations. With several rays, blocks "
     "are larger, so an iteration compares fewer pixels, and a run may have more iterations.",
