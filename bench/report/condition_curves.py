@@ -46,6 +46,7 @@ class ConditionCurves:
     question: str
     verdict: str  # begins the sentence with the ratios
     notes: Callable[[Runs], list[str]]
+    also_compared: tuple[float, ...] = ()  # further values of the verdict, without a `reference`
     absent: float = 0.0  # the value of the condition in runs without the key
     reference: str = ""  # preset of the row that the verdict compares with at `compared`; empty: each row at `first`
     leading: str = ""  # begins a sentence on the medians of the first measure at the ends of the condition; empty: none
@@ -112,9 +113,11 @@ class ConditionCurves:
         return None if first is None else statistics.common_ratio(group[key], first[key])
 
     def _over_first(self, lines: list[Line]) -> dict[str, statistics.Interval]:
-        """The ratio of each row of the figure at the compared value to the row at the first value."""
-        compared = [line for line in lines if line["value"] == self.compared and line["gain"] is not None]
-        return {line["name"]: line["gain"] for line in compared if line["preset"] not in self.only_in_table}
+        """The ratio of each row of the figure at the compared values to the row at the first value."""
+        values = (self.compared, *self.also_compared)
+        compared = [line for line in lines if line["value"] in values and line["gain"] is not None]
+        form = "{name} at {value:g}" if self.also_compared else "{name}"
+        return {form.format(**line): line["gain"] for line in compared if line["preset"] not in self.only_in_table}
 
     def _against_reference(self, frame: pd.DataFrame) -> dict[str, statistics.Interval]:
         """The ratio of each other row to the reference row, at the compared value."""

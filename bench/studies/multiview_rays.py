@@ -55,10 +55,11 @@ PAGES = {
         first=1,
         absent=1,
         compared=4,
+        also_compared=(16,),
         measures=(condition_curves.Measure("chamfer_l1", "Chamfer-L1 × 1000 (scene units)", 1e3),),
         title="Many views by rays per pixel.",
         question="At equal cost, do several rays per pixel lower the error of a shape from many views?",
-        verdict="Chamfer-L1 with 4 rays per pixel over that with 1, at equal cost",
+        verdict="Chamfer-L1 with 4 or 16 rays per pixel over that with 1, at equal cost",
         notes=notes,
         only_in_table=(*MASK_ROWS, *CONTROL_ROWS),
     )

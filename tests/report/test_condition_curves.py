@@ -53,6 +53,10 @@ def test_a_row_is_compared_with_itself_at_the_first_value(monkeypatch):
     verdict = page()._verdict(page()._over_first(lines))
     assert "*0.500* (A)" in verdict and "1 other ratio is not significantly different" in verdict
     assert "n = 8 shapes" in verdict
+    further = runs_of({("A", 1): 2.0, ("A", 4): 1.0, ("A", 16): 4.0})
+    lines = page()._lines(further.frame.assign(value=further.frame["config.key"], cost=1.0))
+    ratios = page(also_compared=(16,))._over_first(lines)
+    assert {name: ratio.value for name, ratio in ratios.items()} == pytest.approx({"A at 4": 0.5, "A at 16": 2})
 
 
 def test_a_page_says_that_no_row_has_the_compared_value():
