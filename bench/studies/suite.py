@@ -213,7 +213,9 @@ def _panel(made: Standing, of_set: str | None) -> chart.Panel:
     fewer = [f", {count} at {units(float(b))}" for b, count in counts.items() if count < counts.max()]
     scenes = format.plural(int(counts.max() if len(counts) else 0), "scene")
     sets = ", all sets" if all(_sets_at(made, budget) == made.sets for budget in made.budgets) else ""
-    title = f"{of_set}, {scenes}" if of_set else f"Progress over cost{sets}, {scenes}{''.join(fewer)}"
+    is_whole = counts.equals(made.complete.groupby("budget")["scene"].nunique().reindex(counts.index))
+    of_part = f"{of_set}{'' if is_whole else f', {scenes}'}"
+    title = of_part if of_set else f"Progress over cost{sets}, {scenes}{''.join(fewer)}"
     panel = chart.panel_data(title, COST, "progress", lines)
     panel["x"]["log"], panel["y"]["log"] = True, False
     return panel
