@@ -197,8 +197,11 @@ def _sets_at(made: Standing, budget: float) -> list[str]:
 
 
 def _when(made: Standing, budget: float) -> str:
+    """The budget, with the sets that have it, or the fewer ones that lack it, unless it has all."""
     sets = _sets_at(made, budget)
-    return units(budget) + ("" if sets == made.sets else f" ({', '.join(sets)})")
+    missing = [name for name in made.sets if name not in sets]
+    named = f"without {', '.join(missing)}" if len(missing) < len(sets) else ", ".join(sets)
+    return units(budget) + (f" ({named})" if missing else "")
 
 
 def _panel(made: Standing, of_set: str | None) -> chart.Panel:

@@ -19,6 +19,7 @@ NOTES = (
     "Behind the surface: the percentage of field evaluations, coarse ones included, that are negative (DIST, Fig. 14).",
     "“Published” is DIST, Table 1, on a GTX 1080Ti with another network and scene. Compare ratios, not numbers.",
 )
+ANSWER_END = "; n = one shape."
 WRONG = "Missed / spurious / wrong depth"
 _TIME_METRICS = ("forward_seconds", "backward_seconds", "step_seconds")
 # Metrics of the CSV at the requested size; empty if only a smaller size was finished.
@@ -51,7 +52,9 @@ def make(small: Runs | None, large: Runs | None) -> Result:
 
 
 def _verdict(runs: Runs) -> str:
-    return " ".join(filter(None, (_speedups(runs, size) for size in dict.fromkeys(map(_requested, runs.records)))))
+    answers = (_speedups(runs, size) for size in dict.fromkeys(map(_requested, runs.records)))
+    texts = [answer.removesuffix(ANSWER_END) for answer in answers if answer]
+    return ". ".join(texts) + (ANSWER_END if texts else "")
 
 
 def _speedups(runs: Runs, size: int | None) -> str:
@@ -64,9 +67,9 @@ def _speedups(runs: Runs, size: int | None) -> str:
     factors = [f"{name} *{above / time:.1f}×*" for (_, above), (name, time) in pairwise(chain) if above and time]
     if not factors:
         return table.extremes(f"Step runtime at {size} pixels", dict(steps.values()), "one shape", show=format.seconds)
-    times = [format.seconds(time) for _, time in chain if time]
-    title = f"A step at {size} pixels takes {times[0]} at first and {times[-1]} with all strategies"
-    return f"{title}. Speedup over the previous strategy: {', '.join(factors)}; n = one shape."
+    ends = [f"{format.seconds(time)} ({name})" for name, time in chain if time]
+    title = f"A step at {size} pixels takes {ends[0]} to {ends[-1]}"
+    return f"{title}. Speedup over the previous one: {', '.join(factors)}"
 
 
 def _requested(record: records.Record) -> int | None:

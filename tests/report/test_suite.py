@@ -629,6 +629,12 @@ def test_a_budget_with_only_some_of_the_sets_names_them(tmp_path, monkeypatch):
     assert "At 1 unit, B" in answer and "At 10 units (complete), B" in answer
     caption = study._sample(shown)
     assert "at 1 unit: 20 problems of 10 scenes" in caption and "at 10 units (complete): 10 problems" in caption
+    three = page([*runs, *others, *(replace(run, set="area") for run in runs), *more], tmp_path / "three", monkeypatch)
+    assert study._when(three, 10.0) == "10 units (complete)" and study._when(three, 1.0) == "1 unit"
+    most = page(
+        [*runs, *others, *more, *(replace(run, set="area") for run in [*runs, *more])], tmp_path / "most", monkeypatch
+    )
+    assert study._when(most, 10.0) == "10 units (without pose)"
     half = [run for run in more if run.problem in sorted({run.problem for run in runs})[:5]]
     shown = page([*runs, *others, *half], tmp_path / "half", monkeypatch)
     fewer = [note for note in study._notes(shown) if note.startswith("At 10 units, complete has ")]
