@@ -66,7 +66,8 @@ def make(*several: Runs | None) -> Result:
     keys = {*tuned.complete[[*KEY, "row"]].itertuples(index=False, name=None)}
     shared = [attempt for attempt in gathered.everything if attempt.key[:4] in keys]
     stated = Standing(Gathered(shared, [], []))
-    lines = [_line(row, tuned, stated, chosen) for row in tuned.rows] if tuned.rankings else []
+    ranked_rows = tuned.rankings[UNITS_OF_COST].progress if tuned.rankings else ()
+    lines = [_line(row, tuned, stated, chosen) for row in ranked_rows]
     return Result(
         replace(runs, records=[], left_out=Counter()),
         "The suite, with each renderer's own settings.",

@@ -427,8 +427,10 @@ def test_each_renderer_has_the_candidate_that_is_best_on_validation_shapes(tmp_p
 
 
 def test_with_its_own_setting_each_renderer_is_compared_on_the_same_problems(tmp_path, monkeypatch):
-    """B has a better setting than that of the set, and Dist has not; C has no candidates."""
+    """B has a better setting than that of the set, and Dist has not; C has no candidates, Poor too few iterations."""
     stated = made([("Dist", 0.011, 100.0), ("B", 0.1, 100.0), ("C", 0.02, 100.0)], TEN)
+    poor = {"status": "not_reached", "reason": TOO_EXPENSIVE, "final": inf}
+    stated += [attempt("Poor", scene, {0: 1.0, 9: 1.0}, **poor) for scene in TEN]
     tuned = [
         replace(
             attempt(f"{row}, tuned", scene, {0: 1.0, 9: final}, settings=candidate, preset=row.lower()),
@@ -439,7 +441,7 @@ def test_with_its_own_setting_each_renderer_is_compared_on_the_same_problems(tmp
     ]
     candidates = [
         replace(attempt(row, "vase validation 0", {0: 9.0, 9: error}, settings=name), overrides=changes)
-        for row, errors in {"Dist": [1, 2, 3, 4], "B": [2, 1, 3, 4]}.items()
+        for row, errors in {"Dist": [1, 2, 3, 4], "B": [2, 1, 3, 4], "Poor": [1, 2, 3, 4]}.items()
         for name, error in zip(suite().candidates, errors, strict=True)
         for changes in [setting_overrides("complete", name)]
     ]
@@ -547,7 +549,8 @@ def test_a_row_alone_is_decided_on_fewer_scenes_than_all_pairs():
     assert text.startswith("Mine at 1 unit: significantly more progress than Row 2, Row 3, Dist, Row 4, ")
     assert "less than Row 0; no significant difference from Row 1 (12 scenes, Holm's correction over 11" in text
     few = ranking(runs[runs["scene"].isin(TEN[:4])], "Mine")
-    assert row_alone(few, "Mine", "At 1 unit") == "At 1 unit, 4 scenes cannot decide between Mine and others."
+    undecided = "At 1 unit, 4 scenes cannot decide between Mine and others, whatever their results."
+    assert row_alone(few, "Mine", "At 1 unit") == undecided
 
 
 def test_a_budget_at_which_equal_rows_often_differ_has_no_significant_pair():

@@ -41,7 +41,8 @@ def undecided(ranked: Ranking, when: str) -> str:
 def row_alone(ranked: Ranking, row: str, when: str) -> str:
     """Which rows differ from a row, by a ranking whose tested pairs are those of the row alone."""
     if not ranked.decidable:
-        return f"{when}, {plural(ranked.scenes, 'scene')} cannot decide between {row} and others."
+        reason = "since equal rows would often differ by chance" if ranked.level else "whatever their results"
+        return f"{when}, {plural(ranked.scenes, 'scene')} cannot decide between {row} and others, {reason}."
     worse = [other for other in ranked.progress if (row, other) in ranked.better]
     better = [other for other in ranked.progress if (other, row) in ranked.better]
     equal = [other for other in ranked.progress if other not in (row, *worse, *better)]
