@@ -166,7 +166,7 @@ def _panel(lines: list[Line]) -> tuple[chart.Panel, Labels]:
     lines = [line for line in lines if line["ok"]] or lines
     *coarser, line = lines
     drawn, labels = list[chart.Series](), Labels()
-    for dash, each in zip(("-", "--", "-."), (line, *reversed(coarser)), strict=False):
+    for dash, each in zip(("-", "--", "-."), (line, *coarser), strict=False):
         drawn += _front(each, dash, is_coarser=each is not line)
     drawn += [_point(line, candidate) for candidate in line["candidates"].results]
     for choice, (*_, heading, marker, size) in CHOICES.items():
