@@ -85,8 +85,11 @@ def main(arguments: list[str] | None = None) -> int:
     into = Path(RESULTS) / "photos.png"
     parser.add_argument("--into", type=Path, default=into, help="the picture (default: %(default)s)")
     options = parser.parse_args(arguments)
-    into = options.into / "photos.png" if options.into.is_dir() else options.into.with_suffix(".png")
+    into = options.into / "photos.png" if options.into.is_dir() else options.into
     try:
+        if into.suffix.lower() not in ("", ".png"):
+            raise ValueError(f"--into must end in .png, or name a folder that exists, found {into}")
+        into = into.with_suffix(".png")
         into.parent.mkdir(parents=True, exist_ok=True)
         masks = not options.without_masks
         reading = ReadSettings(options.longest, masks, options.axes, options.held_out, options.images, unchecked=True)

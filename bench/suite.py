@@ -71,6 +71,7 @@ def main(arguments: Sequence[str]) -> int:
     try:
         options, overrides = parse_arguments(arguments)
         results_dir = Path(dict(text.split("=", 1) for text in overrides).get("results_dir", RESULTS))
+        _make_folder(results_dir)
         if options["setting"] != CANDIDATES:
             print(_expected_runtime(options, _renderers(overrides)))
         for title, keys in _sweeps(options, overrides, results_dir):
@@ -83,6 +84,14 @@ def main(arguments: Sequence[str]) -> int:
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+
+
+def _make_folder(results_dir: Path) -> None:
+    try:
+        results_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = f"results_dir={results_dir} cannot be made ({error.strerror})"
+        raise ValueError(f"{reason}: name a folder that you may write to") from error
 
 
 def parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:

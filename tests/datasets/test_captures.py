@@ -256,6 +256,8 @@ def test_pixels_are_used_as_stored_or_rotated_if_cameras_have_that_size(tmp_path
 def test_a_missing_image_leaves_its_camera_out(tmp_path, capsys):
     nerf(tmp_path)
     (tmp_path / "train" / "r_4.png").unlink()
+    assert main([str(tmp_path), "--into", str(tmp_path / "photos.abc")]) == 2
+    assert "--into must end in .png" in capsys.readouterr().err
     assert main([str(tmp_path), "--into", str(tmp_path / "photos.png")]) == 0
     out = capsys.readouterr().out
     assert "9 photographs" in out and "note: no image for 1 of the cameras, such as ./train/r_4" in out

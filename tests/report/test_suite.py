@@ -466,6 +466,13 @@ def test_candidates_are_the_same_for_all_renderers_on_validation_shapes():
     assert not attempts_of([record], Path())
 
 
+def test_a_results_folder_that_cannot_be_made_ends_the_suite_before_its_first_set(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main([f"results_dir={tmp_path / 'file' / 'results'}", "suite=smoke"]) == 2
+    out, err = capsys.readouterr()
+    assert "set 1" not in out and "cannot be made" in err and "name a folder that you may write to" in err
+
+
 MINE = '''
 import time
 from tests.user_renderer import Mine as Exact
