@@ -39,7 +39,7 @@ from bench.report.suite.attempts import (
     suite,
     write_attempts,
 )
-from bench.report.suite.bias import bias_lines, depth_biases
+from bench.report.suite.bias import bias_lines
 from bench.report.suite.standing import KEY, Standing, units, verified_ranking
 from bench.report.suite.tuned import CANDIDATES, STATED, Chosen, chosen_settings, setting_overrides
 from bench.report.suite.verdicts import row_alone, undecided
@@ -226,8 +226,8 @@ def print_standing(results_dir: Path, setting: str = STATED) -> int:
     _print_rows(standing, local_rows)
     if standing.complete["problem"].nunique() <= MAX_PRINTED_PROBLEMS:
         _print_errors(standing, local_rows)
-    biases = depth_biases(standing.reached[~standing.reached["tuned"]])
-    for line in (line for row in sorted(local_rows) for line in bias_lines(biases, row)):
+    runs = standing.reached[~standing.reached["tuned"]]
+    for line in (line for row in sorted(local_rows) for line in bias_lines(runs, row)):
         print(line)
     print(*(path.with_suffix(".png") for path in written if path.with_suffix(".png").is_file()), index, sep="\n")
     return 0

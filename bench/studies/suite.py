@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bench.report.study import Result, Runs, chart, figure_style, format, merge_runs, table
+from bench.report.study import Result, Runs, chart, figure_style, format, merge_runs, statistics, table
 from bench.report.suite import standing
 from bench.report.suite.attempts import (
     SECOND_START_NOISE,
@@ -63,9 +63,9 @@ PROGRESS = (
 
 BIAS = (
     "Depth bias: the median over pixels of the final surface's depth minus the true one, in scene units. It is "
-    "negative in front of the true surface. The table has its mean over scenes. A small systematic error of hits "
-    "shows there, and not in the final error. Sign-flip tests over scenes compare rows with DIST, with Holm's "
-    f"correction over rows and sets of a budget at {percent(ALPHA)}."
+    "negative in front of the true surface. The table has its median over scenes. A small systematic error of hits "
+    "shows there, and not in the final error. Sign tests over scenes compare rows with DIST, with Holm's correction "
+    f"over rows and sets of a budget at {percent(statistics.ALPHA)}."
 )
 TUNED = (
     "Tuned: each renderer with its own learning rate and rays, chosen on validation shapes. With fewer problems than "

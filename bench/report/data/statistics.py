@@ -144,7 +144,7 @@ def ratio_verdicts(ratios: Sequence[Interval]) -> list[Verdict]:
     """
     counted = [index for index, ratio in enumerate(ratios) if ratio.has_ends]
     tests = (
-        [_sign_test_p_value(ratios[index].points) for index in counted],
+        [sign_test_p_value(ratios[index].points) for index in counted],
         [_min_p_value(len(ratios[index].points)) for index in counted],
     )
     rejected, decidable = ({index for index, sure in zip(counted, holm(test), strict=True) if sure} for test in tests)
@@ -176,9 +176,9 @@ def _min_p_value(shapes: int) -> float:
     return 2.0 * 0.5**shapes
 
 
-def _sign_test_p_value(points: Sequence[float]) -> float:
-    """Two-sided, of values against 1; values of 1 do not count."""
-    below, above = sum(x < 1 for x in points), sum(x > 1 for x in points)
+def sign_test_p_value(points: Sequence[float], centre: float = 1.0) -> float:
+    """Two-sided, of the values' median against `centre`; equal values do not count."""
+    below, above = sum(x < centre for x in points), sum(x > centre for x in points)
     return min(1.0, 2 * float(special.bdtr(min(below, above), below + above, 0.5)))
 
 
