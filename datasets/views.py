@@ -41,13 +41,13 @@ class ViewSampler:
     rays_per_pixel: int = 1
 
     def __post_init__(self) -> None:
-        check_positive("distance", self.distance, "2.5 sees the whole unit sphere at 50 degrees")
+        check_positive("view.distance", self.distance, "2.5 sees the whole unit sphere at 50 degrees")
         check_at_least("view.resolution", self.resolution, 4, "set scale.resolution=64 or view.resolution=64")
         if not 0 < self.field_of_view < 180:
-            raise ValueError(f"field_of_view must lie between 0 and 180 degrees, not {self.field_of_view}")
+            raise ValueError(f"view.field_of_view must lie between 0 and 180 degrees, not {self.field_of_view}")
         if not -inf < self.azimuth[0] <= self.azimuth[1] < inf:
-            raise ValueError(f"azimuth must rise and be finite, in degrees, not {list(self.azimuth)}")
-        check_elevation("elevation", self.elevation)
+            raise ValueError(f"view.azimuth must rise and be finite, in degrees, not {list(self.azimuth)}")
+        check_elevation("view.elevation", self.elevation)
         if self.rays_per_pixel < 1 or isqrt(self.rays_per_pixel) ** 2 != self.rays_per_pixel:
             raise ValueError(f"view.rays_per_pixel must be 1, 4, 9, 16, ..., not {self.rays_per_pixel}")
 

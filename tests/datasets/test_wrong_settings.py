@@ -32,11 +32,11 @@ def moved(number: float) -> np.ndarray:
 
 
 WRONG: list[tuple[str, Callable, dict]] = [  # words of the error, what is built, and its settings
-    ("distance must be positive, not nan", view, {"distance": NAN}),
+    ("view.distance must be positive, not nan", view, {"distance": NAN}),
     ("resolution must be at least 4, not 3: set", view, {"resolution": 3}),
-    ("field_of_view must lie between 0 and 180 degrees, not 180", view, {"field_of_view": 180.0}),
-    ("elevation must rise within -90 to 90 degrees", view, {"elevation": (0.0, 90.0)}),
-    ("elevation must rise within -90 to 90 degrees", view, {"elevation": (35.0, 15.0)}),
+    ("view.field_of_view must lie between 0 and 180 degrees, not 180", view, {"field_of_view": 180.0}),
+    ("view.elevation must rise within -90 to 90 degrees", view, {"elevation": (0.0, 90.0)}),
+    ("view.elevation must rise within -90 to 90 degrees", view, {"elevation": (35.0, 15.0)}),
     *((r"eye must not lie on, above or below target.*lower the elevation", look_at,
        {"eye": torch.tensor([0.0, height, 0.0]), "target": torch.zeros(3)}) for height in (2.0, -2.0, 0.0)),
     *((f'points must be "dense", a share up to "100%", or a .*, not .{points}', pixels, {"points": points})
